@@ -1,7 +1,7 @@
-"""Add factors of your own on poses: a GNSS receiver measures the position beside the cones.
+"""Add factors of your own on poses: a GNSS receiver measures the position in addition to the cones.
 
-The mapper takes any GTSAM factor together with a cycle. Here a receiver gives the vehicle's position in the
-map frame once a second. Each fix is a `gtsam.PoseTranslationPrior2D` on the pose of its cycle.
+The mapper accepts any GTSAM factors with a cycle. Here a receiver measures the vehicle's position in the map
+frame once a second. Each fix is a `gtsam.PoseTranslationPrior2D` on the pose of its cycle.
 
     python examples/gnss.py
 """
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 SIGMA_GNSS = 0.3
 """Standard deviation of a fix in each direction (m)."""
 EVERY = 10
-"""Cycles from one fix to the next, a second."""
+"""Number of cycles from one fix to the next (1 s)."""
 
 
 def build_log(laps: int = 1, seed: int = 0) -> Log:
@@ -32,7 +32,7 @@ def build_log(laps: int = 1, seed: int = 0) -> Log:
 
 
 def true_positions(log: Log) -> Array:
-    """Return the true position (n, 2) of the vehicle at each perception cycle, in m, map frame."""
+    """True positions (n, 2) of the vehicle at the perception cycles, in m, map frame."""
     assert log.truth is not None
     stamps = [cycle.t for cycle in log.cycles]
     truth = log.truth
@@ -40,14 +40,14 @@ def true_positions(log: Log) -> Array:
 
 
 def gnss_factor(key: int, fix: Array) -> gtsam.NonlinearFactor:
-    """Return the factor of a fix (2,) in m, map frame. Huber's loss allows for outliers."""
+    """Build the factor of a fix (2,) in m, map frame; Huber's loss limits outliers."""
     gaussian = gtsam.noiseModel.Isotropic.Sigma(2, SIGMA_GNSS)
     robust = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(1.345), gaussian)
     return gtsam.PoseTranslationPrior2D(key, fix, robust)
 
 
 def drive(log: Log, fixes: Array | None) -> Array:
-    """Return the estimated position (n, 2) of each cycle, with fixes (n, 2) or without."""
+    """Map a log with fixes (n, 2) or without; return the estimated position (n, 2) of each cycle."""
     mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     positions = []
     for cycle, (odometry, detections) in enumerate(split_odometry(log)):
@@ -59,7 +59,7 @@ def drive(log: Log, fixes: Array | None) -> Array:
 
 
 def main(laps: int = 1, seed: int = 0) -> tuple[float, float]:
-    """Return the root mean square error of the position (m) without and with the receiver."""
+    """Return the rms error of the position (m) without and with the receiver."""
     log = build_log(laps, seed)
     truth = true_positions(log)
     fixes = truth + np.random.default_rng(seed).normal(0.0, SIGMA_GNSS, truth.shape)
@@ -69,4 +69,4 @@ def main(laps: int = 1, seed: int = 0) -> tuple[float, float]:
 
 if __name__ == "__main__":
     alone, with_gnss = main()
-    print(f"rms position error: {alone:.2f} m by cones alone, {with_gnss:.2f} m with GNSS")
+    print(f"rms position error: {alone:.2f} m with cones alone, {with_gnss:.2f} m with GNSS")

@@ -1,7 +1,7 @@
-"""Looks at the graph: its factors and their errors, uncertainties by GTSAM's own classes, and a picture.
+"""Inspect the graph: factors and their errors, uncertainties by GTSAM's own classes, and a picture.
 
-`mapper.graph()` is the window as a `gtsam.NonlinearFactorGraph`, and `mapper.values()` is its estimate.
-Whatever GTSAM does with a graph works on them.
+`mapper.graph()` is the window as a `gtsam.NonlinearFactorGraph`, `mapper.values()` is its estimate. All of
+GTSAM works on them.
 
     python examples/look_at_graph.py
 """
@@ -9,6 +9,7 @@ Whatever GTSAM does with a graph works on them.
 from __future__ import annotations
 
 from collections import defaultdict
+from itertools import islice
 from pathlib import Path
 
 import gtsam
@@ -25,18 +26,16 @@ POSE, CALIBRATION, SENSOR = ord("x"), ord("b"), ord("c")
 
 
 def build_mapper(cycles: int = 150, seed: int = 0) -> FixedLagMapper:
-    """Return a mapper after a number of cycles on a generated track."""
+    """Map a number of cycles on a generated track."""
     log = simulate(generate_track(np.random.default_rng(seed)), SimulationSettings(laps=1), seed)
     mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
-    for number, (odometry, detections) in enumerate(split_odometry(log)):
-        if number == cycles:
-            break
+    for odometry, detections in islice(split_odometry(log), cycles):
         mapper.update(odometry, detections)
     return mapper
 
 
 def kind(factor: gtsam.NonlinearFactor) -> str:
-    """Return the kind of a factor of the mapper, which its class and its keys tell."""
+    """Name the kind of a factor of the mapper, by its class and its keys."""
     letters = {gtsam.symbolChr(key) for key in list(factor.keys())}
     if isinstance(factor, gtsam.CustomFactor):
         return "odometry" if CALIBRATION in letters else "spline projection"
@@ -48,7 +47,7 @@ def kind(factor: gtsam.NonlinearFactor) -> str:
 
 
 def errors_by_kind(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> dict[str, tuple[int, float]]:
-    """Return the number of factors of each kind, and the sum of their errors (half the squared sigmas)."""
+    """Count the factors of each kind, and sum their errors (half the squared sigmas)."""
     found: defaultdict[str, tuple[int, float]] = defaultdict(lambda: (0, 0.0))
     for index in range(graph.size()):
         factor = graph.at(index)
@@ -58,7 +57,7 @@ def errors_by_kind(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> d
 
 
 def draw(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, axes: Axes) -> None:
-    """Draw poses and control points, and a line from the pose of each projection factor to its points."""
+    """Draw poses and control points, and lines from the pose of each projection factor to its points."""
     positions = {
         key: _position(values, key)
         for key in list(values.keys())
@@ -91,7 +90,7 @@ def _position(values: gtsam.Values, key: int) -> np.ndarray:
 
 
 def main(folder: Path = Path(), cycles: int = 150) -> dict[str, tuple[int, float]]:
-    """Write `graph.dot` and `graph.png` to a folder and returns the errors by kind of factor."""
+    """Write `graph.dot` and `graph.png` to a folder; return the errors by kind of factor."""
     mapper = build_mapper(cycles)
     graph, values = mapper.graph(), mapper.values()
     graph.saveGraph(str(folder / "graph.dot"), values)
@@ -108,11 +107,7 @@ if __name__ == "__main__":
     mapper = build_mapper()
     marginals = gtsam.Marginals(mapper.graph(), mapper.values())
     newest = mapper.next_pose_key - 1
-    print(
-        "newest pose, sigmas by GTSAM (its own frame):",
-        np.sqrt(np.diag(marginals.marginalCovariance(newest))),
-    )
-    print(
-        "the same by the mapper (map frame):          ",
-        np.sqrt(np.diag(mapper.marginal_covariance([newest]))),
-    )
+    covariances = marginals.marginalCovariance(newest), mapper.marginal_covariance([newest])
+    own, in_map = (np.sqrt(np.diag(covariance)) for covariance in covariances)
+    print("sigmas of the newest pose by GTSAM, in its own frame:", own)
+    print("sigmas of the newest pose by the mapper, map frame:  ", in_map)

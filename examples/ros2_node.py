@@ -1,4 +1,4 @@
-"""A ROS 2 node: it takes odometry and detections, and publishes the map, the path and what is ahead.
+"""ROS 2 node that takes odometry and detections, and publishes the map, the path and the track ahead.
 
     python examples/ros2_node.py --ros-args -r odometry:=/odom -r detections:=/cones -p markers:=false
 
@@ -33,7 +33,7 @@ STEP = 1.0
 AHEAD = 20.0
 """Distance up to which boundaries and centre line are published in the vehicle's frame (m)."""
 CENTRE = 2
-"""Number of the centre line among the lines."""
+"""Identifier of the centre line among the lines."""
 COLOURS = {LEFT: (0.0, 0.2, 1.0), RIGHT: (1.0, 0.9, 0.0), CENTRE: (1.0, 1.0, 1.0)}
 """Red, green and blue of each line."""
 LINE_STRIP = 4
@@ -41,19 +41,19 @@ LINE_STRIP = 4
 
 
 class Bridge:
-    """Hands ROS messages to a mapper, which no message can stop."""
+    """Passes ROS messages to a mapper; no message can stop it."""
 
     def __init__(
         self, mounting: tuple[float, float, float] = (0.0, 0.0, 0.0), wait: float = 0.0, known: str = ""
     ) -> None:
-        """Begin a map, or on a `known` one, that of a folder."""
+        """Begin a new map, or continue on the `known` map of a folder."""
         sigma = np.array(SIGMA_ODOMETRY)
         on = partial(FixedLagMapper.on, read_map(known)) if known else FixedLagMapper
         self.mapper: FixedLagMapper = on(odometry_sigma=sigma)
         self.stream = MessageStream(Frames(mounting), wait)
 
     def update(self, message: Any, received: float) -> CycleResult | None:
-        """Map a message with detections, received at this time (s); return the last result, if any."""
+        """Map a message with detections, received at a time (s); return the last result, if any."""
         result: CycleResult | None = None
         for cycle in self.stream.take_detections(message, received):
             try:
@@ -65,13 +65,13 @@ class Bridge:
         return result
 
     def save(self, folder: Path) -> None:
-        """Write `map.json` to a folder, which `pathspace-graph plot` and `export` read."""
+        """Write `map.json` to a folder, for `pathspace-graph plot` and `export`."""
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / MAP_FILE, map_to_json(self.mapper.map()))
 
 
 def boundary_points(track: Map) -> dict[int, Array]:
-    """Return points (n, 2) along each boundary, in m, map frame."""
+    """Sample points (n, 2) along each boundary, in m, map frame."""
     points = {}
     for label, boundary in track.boundaries.items():
         if isinstance(boundary, SplineBoundary):
@@ -81,7 +81,7 @@ def boundary_points(track: Map) -> dict[int, Array]:
 
 
 def fill_line(marker: Any, points: Array, label: int, make_point: Any) -> Any:
-    """Fill in a `Marker` as a line through points (n, 2)."""
+    """Fill a `Marker` with a line through points (n, 2)."""
     marker.ns, marker.id, marker.type = "track", label, LINE_STRIP
     marker.scale.x, marker.pose.orientation.w = 0.1, 1.0
     colour = marker.color
@@ -91,7 +91,7 @@ def fill_line(marker: Any, points: Array, label: int, make_point: Any) -> Any:
 
 
 def fill_pose(stamped: Any, pose: Array) -> Any:
-    """Fill in a `PoseStamped` by a pose (3,), map frame."""
+    """Fill a `PoseStamped` with a pose (3,), map frame."""
     at = stamped.pose
     at.position.x, at.position.y = pose[:2].tolist()
     at.orientation.z, at.orientation.w = float(np.sin(pose[2] / 2)), float(np.cos(pose[2] / 2))
@@ -99,8 +99,8 @@ def fill_pose(stamped: Any, pose: Array) -> Any:
 
 
 def main() -> None:
-    """Run the node until it is stopped, and then write the map to the folder `map`."""
-    import rclpy  # ROS is needed here only
+    """Run the node until it is stopped, then write the map to the folder `map`."""
+    import rclpy  # only `main` needs ROS
     from geometry_msgs.msg import Point, PoseStamped
     from nav_msgs.msg import Odometry
     from nav_msgs.msg import Path as PathMessage

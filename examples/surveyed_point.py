@@ -1,8 +1,8 @@
-"""Add factors of your own on control points: a boundary must pass through a surveyed point.
+"""Add factors of your own on control points: a boundary passes through a surveyed point.
 
-Somebody has measured the position of one cone of the left boundary to a few centimetres. As soon as the curve
-has grown past it, a factor on the control points there tells the mapper. The factor stays nonlinear while
-these control points are active, and is a part of the map's prior afterwards.
+The position of one cone of the left boundary is known to a few centimetres. After the curve has grown past
+it, the mapper gets a factor on the control points there. The factor stays nonlinear while these control
+points are active, and then becomes part of the map's prior.
 
     python examples/surveyed_point.py
 """
@@ -27,7 +27,7 @@ SIGMA_SURVEY = 0.02
 REACH = 3.0
 """Length along the curve, to both sides, in which its foot point is searched (m)."""
 AWAY = 5.0
-"""Distance from the point at which a curve has not grown past it yet (m)."""
+"""Distance from the point beyond which a curve has not grown past it yet (m)."""
 
 
 def build_log(laps: int = 1, seed: int = 0) -> Log:
@@ -45,7 +45,7 @@ def survey(log: Log, share: float = 0.4) -> Array:
 
 
 def survey_factor(mapper: FixedLagMapper, point: Array) -> gtsam.NonlinearFactor | None:
-    """Return a factor that holds the left boundary on a point (2,), or None while the curve is not there."""
+    """Build a factor of the left boundary and a point (2,); None until the curve has grown past it."""
     if LEFT not in mapper.boundaries:
         return None
     boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
@@ -64,7 +64,7 @@ def survey_factor(mapper: FixedLagMapper, point: Array) -> gtsam.NonlinearFactor
 
 
 def drive(log: Log, point: Array | None) -> FixedLagMapper:
-    """Map a log, with a surveyed point (2,) or without, and returns the mapper."""
+    """Map a log with a surveyed point (2,) or without; return the mapper."""
     mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     added = False
     for odometry, detections in split_odometry(log):
@@ -75,7 +75,7 @@ def drive(log: Log, point: Array | None) -> FixedLagMapper:
 
 
 def distance(mapper: FixedLagMapper, point: Array) -> float:
-    """Return the distance (m) of the left boundary from a point (2,)."""
+    """Distance (m) of the left boundary from a point (2,)."""
     boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
     curve = boundary.evaluate(points, np.linspace(boundary.tables.low, boundary.tables.high, 4000))
     return float(np.hypot(*(curve - point).T).min())
@@ -90,6 +90,4 @@ def main(laps: int = 1, seed: int = 0) -> tuple[float, float]:
 
 if __name__ == "__main__":
     without, with_survey = main()
-    print(
-        f"the left boundary passes the surveyed point by {without:.3f} m, {with_survey:.3f} m with the factor"
-    )
+    print(f"distance of the boundary: {without:.3f} m without the factor, {with_survey:.3f} m with it")

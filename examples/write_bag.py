@@ -1,7 +1,7 @@
-"""Write a log as a ROS 2 bag, as a car would record it: odometry, and a point cloud of cones with labels.
+"""Write a log as a ROS 2 bag, as a car would record it: odometry, and point clouds of cones with labels.
 
-It needs no ROS, but the package `rosbags`, which comes with `pip install -e '.[ros]'`. Whoever
-has no bag yet can try `pathspace-graph convert` with it.
+Use it to try `pathspace-graph convert` without a bag of your own. It needs no ROS, but the package `rosbags`
+of `pip install -e '.[ros]'`.
 
     python examples/write_bag.py LOG BAG
 """
@@ -21,32 +21,32 @@ from pathspace_graph import Detections, Log, read_log
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 """Messages of ROS 2."""
 EPOCH = 1_700_000_000
-"""Clock of the bag (s since 1970) where the log's is at 0."""
+"""Time in the bag (s since 1970) at time 0 of the log."""
 FLOAT32, UINT8 = 7, 2
 """Codes of a point cloud's types."""
 COLUMNS = {"x": "<f4", "y": "<f4", "z": "<f4", "label": "u1"}
-"""A cone of the cloud has a place in the vehicle frame (m), and the label 0 for left, 1 for right or 2."""
+"""Fields of a cone: position in the vehicle frame (m), and label (0 left, 1 right, 2 unknown)."""
 
 
 def make(name: str, /, **fields: Any) -> Any:
-    """Return a message."""
+    """Make a message."""
     return STORE.types[name](**fields)
 
 
 def vector(name: str, *values: float) -> Any:
-    """Return a message with the fields x, y, z and, for four values, w."""
+    """Make a message with the fields x, y, z and, for four values, w."""
     return make(f"geometry_msgs/msg/{name}", **dict(zip("xyzw", values, strict=False)))
 
 
 def header(t: float, frame: str) -> Any:
-    """Return a header with a stamp (s)."""
+    """Make a header with a stamp (s)."""
     nanoseconds = round(t * 1e9)
     stamp = make("builtin_interfaces/msg/Time", sec=EPOCH + nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
     return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
 
 def odometry(t: float, twist: np.ndarray) -> Any:
-    """Return a twist (vx, vy, wz) as `nav_msgs/Odometry`; the pose is left at the origin."""
+    """Convert a twist (vx, vy, wz) to `nav_msgs/Odometry`; the pose stays at the origin."""
     vx, vy, wz = (float(value) for value in twist)
     still = make(
         "geometry_msgs/msg/Pose",
@@ -69,7 +69,7 @@ def odometry(t: float, twist: np.ndarray) -> Any:
 
 
 def cloud(cycle: Detections) -> Any:
-    """Return the cones of a perception cycle as `sensor_msgs/PointCloud2`."""
+    """Convert the cones of a perception cycle to `sensor_msgs/PointCloud2`."""
     cones = np.zeros(len(cycle.labels), np.dtype(list(COLUMNS.items())))
     cones["x"], cones["y"] = cycle.points_vehicle.T
     cones["label"] = cycle.labels

@@ -92,7 +92,7 @@ class Curves:
         coarse_step: float,
         iterations: int,
     ) -> _FootPoints:
-        """Return `footpoint:joint_foot_points`."""
+        """Find foot points as `footpoint:foot_points`; `curve` (m,) is the index of each row's curve."""
 
     def refine(
         self,
@@ -104,7 +104,11 @@ class Curves:
         u_high: Array,
         iterations: int,
     ) -> _FootPoints:
-        """Return `footpoint:refine_joint_foot_points`; a row that a step leads farther away is searched."""
+        """Find the local minima of |S(u) - p_i| downhill from u_start (m,) by safeguarded Newton steps.
+
+        The other arguments are as in `search`. A start outside its stretch is moved into it first. No step
+        exceeds one mean knot interval; a row that a step leads farther away is searched.
+        """
 
 # --- detections and odometry -----------------------------------------------------------------------------
 def to_map(points_vehicle: Array, poses: Array) -> Array:
@@ -210,10 +214,10 @@ def columns_of(layout: _Layout, rows: _Rows) -> IntArray:
 def moved_residual(layout: _Layout, rows: _Rows, change: Array) -> Array:
     """Return `r - J c` (m,) with c the change (n,) of a layout's variables; ValueError for rows on others."""
 
-def block_of(layout: _Layout, groups: Sequence[_Rows]) -> tuple[IntArray, Array]:
-    """Return the places (h,) of the variables that rows hold, and `[J -r]` (m, n + 1) on them, by columns.
+def blocks_of(layout: _Layout, groups: Sequence[_Rows]) -> list[tuple[int, IntArray, Array]]:
+    """Return each owner, ascending, with places (h,) of the variables that its rows hold, and `[J -r]`.
 
-    ValueError where rows hold variables that the layout does not.
+    The block (m, n + 1) is on these variables, stored by columns. ValueError for rows on others.
     """
 
 class RowStore:
@@ -251,7 +255,7 @@ class RowStore:
         """Remove all rows of some owners."""
 
     def pop(self, owner: int, layout: _Layout) -> tuple[IntArray, Array]:
-        """Remove the rows of an owner; return them as `block_of` does."""
+        """Remove the rows of an owner; return places and block as `blocks_of` does."""
 
 def summed(
     layout: _Layout, factors: list[tuple[IntArray, Array]], stores: Sequence[RowStore], change: Array

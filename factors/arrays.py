@@ -1,4 +1,4 @@
-"""Array types by their numbers, and arrays that nothing writes."""
+"""Array types by dtype, and read-only arrays."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,6 @@ BoolArray = NDArray[np.bool_]
 
 
 def read_only(array: Array) -> Array:
-    """Return an array that can't be written from now on, so that copies of an estimator share it."""
+    """Make an array read-only, so that copies of an estimator can share it."""
     array.setflags(write=False)
     return array

@@ -18,19 +18,19 @@ from .arrays import Array, IntArray
 
 
 def domain(knots: Array, degree: int) -> tuple[float, float]:
-    """Return the limits knots[p] and knots[n] of the domain, where all p + 1 basis functions exist."""
+    """Limits knots[p] and knots[n] of the domain, where all p + 1 basis functions exist."""
     return float(knots[degree]), float(knots[len(knots) - degree - 1])
 
 
 def divisors(width: Array) -> Array:
-    """Return each width, or infinity where it is zero, so that 0 / 0 is taken as 0."""
+    """Replace zero widths by infinity, so that 0 / 0 counts as 0."""
     return np.where(width > 0.0, width, np.inf)
 
 
 def scatter(values: Array, first: IntArray, size: int, periodic: bool = False) -> Array:
-    """Return dense rows (m, size) of local values (m, p + 1), which begin in the columns `first` (m,).
+    """Scatter local values (m, p + 1) into dense rows (m, size), from the columns `first` (m,) on.
 
-    Columns of a periodic spline are taken modulo `size`, and values in the same column are added.
+    Columns of a periodic spline are taken modulo `size`; values in the same column are summed.
     """
     matrix = np.zeros((len(values), size))
     columns = first[:, None] + np.arange(values.shape[1])
@@ -41,17 +41,17 @@ def scatter(values: Array, first: IntArray, size: int, periodic: bool = False) -
 
 
 def uniform_knots(count: int, degree: int, interval: float = 1.0, start: float = 0.0) -> Array:
-    """Return unclamped, equally spaced knots of `count` control points; the domain begins at `start`."""
+    """Floating (unclamped), equally spaced knots of `count` control points; the domain begins at `start`."""
     return start + interval * np.arange(-degree, count + 1, dtype=np.float64)
 
 
 def clamped_knots(breaks: Array, degree: int) -> Array:
-    """Return the breaks (k + 1,) with both ends repeated p times more, as knots of k + p control points."""
+    """Clamped knots of k + p control points: breaks (k + 1,) with both ends repeated p more times."""
     return np.concatenate([np.full(degree, breaks[0]), breaks, np.full(degree, breaks[-1])])
 
 
 def periodic_knots(breaks: Array, degree: int) -> Array:
-    """Return one period of m + 1 > p breaks with p more on either side: knots of m + p control points."""
+    """Knots of m + p control points: one period of m + 1 > p breaks, with p more on either side."""
     period = breaks[-1] - breaks[0]
     before = breaks[-1 - degree : -1] - period
     after = breaks[1 : degree + 1] + period
@@ -62,10 +62,10 @@ def periodic_knots(breaks: Array, degree: int) -> Array:
 class SpanPolynomials:
     """Basis functions as polynomials of s = (u - t_i) / (t_{i+1} - t_i) on each span i."""
 
-    knots: Array  # (n + p + 1,) not decreasing, and unwrapped where the curve is periodic
+    knots: Array  # (n + p + 1,) non-decreasing; unwrapped if the curve is periodic
     degree: int
-    periodic: bool = False  # parameters are taken modulo the length of the domain instead of being clipped
-    known: Array | None = field(default=None, repr=False)  # coefficients of the first spans
+    periodic: bool = False  # wrap parameters into the domain instead of clipping them
+    known: Array | None = field(default=None, repr=False)  # coefficients of the first spans, if computed
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "knots", np.ascontiguousarray(self.knots, dtype=np.float64))
@@ -91,7 +91,7 @@ class SpanPolynomials:
 
     @cached_property
     def coefficients(self) -> Array:
-        """N_{i-p+j}(u) is sum_k coefficients[k, i - p, j] s^k; the shape is (p + 1, n - p spans, p + 1)."""
+        """`N_{i-p+j}(u) = sum_k coefficients[k, i - p, j] s^k`; shape (p + 1, n - p spans, p + 1)."""
         if self.known is None:
             return _span_coefficients(self.knots, self.degree)
         count = self.known.shape[1]
@@ -109,11 +109,11 @@ class SpanPolynomials:
         return {0: self.coefficients}
 
     def extended(self, knots: Array) -> SpanPolynomials:
-        """Return an open curve's polynomials on knots that begin with these; only new spans are computed."""
+        """Extend an open curve to knots that begin with its own; only new spans are computed."""
         return SpanPolynomials(knots, self.degree, False, self.coefficients)
 
     def tail(self, first: int) -> SpanPolynomials:
-        """Return an open curve's polynomials without its first control points; other spans stay the same."""
+        """Drop the first control points of an open curve; the remaining spans do not change."""
         return SpanPolynomials(self.knots[first:], self.degree, False, self.coefficients[:, first:])
 
     @property
@@ -122,22 +122,22 @@ class SpanPolynomials:
 
     @property
     def size(self) -> int:
-        """Return the number of distinct control points."""
+        """Number of distinct control points."""
         return len(self.starts) if self.periodic else len(self.starts) + self.degree
 
     @property
     def occupied(self) -> int:
-        """Return the number of spans up to the last one that is not empty."""
+        """Number of spans up to the last one that is not empty."""
         return len(self._breaks) + 1
 
     def inside(self, u: Array) -> Array:
-        """Return u wrapped into the domain of a periodic curve, or clipped to the domain of an open one."""
+        """Wrap u into the domain of a periodic curve, or clip it to the domain of an open one."""
         if self.periodic:
             u = u - self.length * np.floor((u - self.low) / self.length)
         return np.minimum(np.maximum(u, self.low), self.high)
 
     def locate(self, u: Array) -> tuple[IntArray, Array]:
-        """Return the span number (m,), in [0, n - p), and s (m,), in [0, 1], of each u (m,), put `inside`."""
+        """Return span numbers (m,) in [0, n - p) and s (m,) in [0, 1] of u (m,), moved `inside` first."""
         inside = self.inside(u)
         number = self._breaks.searchsorted(inside, side="right")
         return number, (inside - self.starts.take(number)) * self.inverse_widths.take(number)
@@ -151,8 +151,8 @@ class SpanPolynomials:
     def evaluate(self, u: Array, derivatives: int = 0) -> tuple[Array, IntArray]:
         """Return basis values and derivatives (derivatives + 1, m, p + 1) at u (m,), and the spans (m,) of u.
 
-        u is put `inside`. Column j belongs to the control point span - p + j. A derivative at a knot is the
-        one from the right, and at the right end of the domain the one from the left.
+        u is moved `inside` first. Column j belongs to the control point span - p + j. Derivatives at a knot
+        are right-sided, and left-sided at the right end of the domain.
         """
         number, s = self.locate(u)
         values = horner(self._stack(derivatives).take(number, axis=1), s[:, None])
@@ -160,7 +160,7 @@ class SpanPolynomials:
         return by_order, number + self.degree
 
     def _stack(self, derivatives: int) -> Array:
-        """Return the polynomials of all orders side by side: (p + 1, n - p, (derivatives + 1) (p + 1))."""
+        """Stack the polynomials of all orders: (p + 1, n - p, (derivatives + 1) (p + 1))."""
         if derivatives not in self._stacks:
             orders = [_derivative(self.coefficients, r, self.inverse_widths) for r in range(derivatives + 1)]
             self._stacks[derivatives] = np.ascontiguousarray(np.concatenate(orders, axis=2))
@@ -168,7 +168,7 @@ class SpanPolynomials:
 
 
 def horner(terms: Array, s: Array) -> Array:
-    """Return sum_k terms[k] s^k for terms (p + 1, m, ...) and s, which broadcasts to the shape of a term."""
+    """Evaluate `sum_k terms[k] s^k` for terms (p + 1, m, ...) and s, which broadcasts to a term's shape."""
     total: Array = terms[-1] * s
     total += terms[-2]
     for term in terms[-3::-1]:
@@ -178,7 +178,7 @@ def horner(terms: Array, s: Array) -> Array:
 
 
 def _span_coefficients(knots: Array, degree: int) -> Array:
-    """Return the coefficients (p + 1 powers, n - p spans, p + 1) in s, by the recurrence of de Boor (1972).
+    """Compute the coefficients (p + 1 powers, n - p spans, p + 1) in s by the recurrence of de Boor (1972).
 
         N_i^p = (u - t_i) / (t_{i+p} - t_i) N_i^{p-1} + (t_{i+p+1} - u) / (t_{i+p+1} - t_{i+1}) N_{i+1}^{p-1}
 
@@ -203,7 +203,7 @@ def _span_coefficients(knots: Array, degree: int) -> Array:
 
 
 def _derivative(coefficients: Array, order: int, inverse_widths: Array) -> Array:
-    """Return d^r/du^r of polynomials of s = (u - start) / width, in the same shape."""
+    """Differentiate polynomials of s = (u - start) / width r times by u; the shape does not change."""
     derived = np.zeros_like(coefficients)
     for power in range(order, len(coefficients)):
         derived[power - order] = coefficients[power] * (factorial(power) // factorial(power - order))

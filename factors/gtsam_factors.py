@@ -1,6 +1,6 @@
-"""Residuals as GTSAM factors for any nonlinear graph: projection, spacing, smoothness and odometry.
+"""GTSAM factors for any nonlinear graph: projection, stations, spacing, smoothness and odometry.
 
-A factor holds its measurement and its keys, but no graph. It is a pure function of the values.
+A factor has its measurement and its keys, but no state: its error is a pure function of the values.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .sensor import corrected
 JacobianList = MutableSequence[Array]
 
 POSE_SIZE = 3
-GRID_SHARE = 0.25  # coarse step of the foot-point search by the mean knot interval
+GRID_SHARE = 0.25  # coarse step of the foot-point search, as a share of the mean knot interval
 
 
 def spline_projection_factors(
@@ -42,23 +42,23 @@ def spline_projection_factors(
     sensor_key: int | None = None,
     twists: Array | None = None,
 ) -> list[gtsam.CustomFactor]:
-    """Return a factor `e_i = n_i . (R z_i + t - S(u_i)) / sigma_i` for the detections of each pose.
+    """Build a factor `e_i = n_i . (R z_i + t - S(u_i)) / sigma_i` for the detections of each pose.
 
-    The rows are those of `detection_rows`. pose_keys (m,) are the keys of each row's own pose, and those of
-    one pose are neighbours. control_keys (k,) are the keys of all distinct control points; a factor holds
-    those that matter in the stretches [low, high] (m,), where foot points are searched for: a few metres
-    about the expected ones. points_vehicle z (m, 2) and covariances (m, 2, 2) are in the vehicle frame, and
-    sigma_model is in m. A row's weight falls beyond the whitened residual `huber`, which may be infinite.
+    The rows come from `detection_rows`. pose_keys (m,) are the keys of the rows' poses; rows of one pose are
+    neighbours. control_keys (k,) are the keys of all distinct control points. A factor depends on those that
+    matter in the stretches [low, high] (m,), in which foot points are searched: a few metres about the
+    expected ones. points_vehicle z (m, 2) and covariances (m, 2, 2) are in the vehicle frame, sigma_model is
+    in m. The weight of a row falls beyond the whitened residual `huber`, which may be infinite.
 
     With a `sensor_key`, the detections are corrected by the sensor's calibration (5,) of that key (see
     `sensor.by_sensor`), with twists (m, 3) of the vehicle in m/s, m/s and rad/s.
 
     Foot points, standard deviations and weights are recomputed at every evaluation. With Jacobians, rows are
     scaled by the square root of their Huber weight. Without, half their squares are the Huber loss, so that
-    an optimizer judges its steps by the true cost. No derivative contains the turning of sigma with the
-    normal, so an optimizer that judges by the error may stop beside the fixed point of Gauss-Newton, by as
-    much as sigma depends on the direction. A row whose foot point is not interior contributes zero; where
-    foot points leave their stretches, the factor is to be created again.
+    an optimizer judges its steps by the true cost. The Jacobians neglect that sigma rotates with the normal,
+    so an optimizer that judges by the error may stop beside the fixed point of Gauss-Newton if sigma depends
+    on the direction. A row whose foot point is not interior contributes zero. If foot points leave their
+    stretches, build the factors again.
     """
     if len(pose_keys) == 0:
         return []
@@ -85,10 +85,10 @@ def station_factors(
     huber: float,
     sensor_key: int | None = None,
 ) -> list[gtsam.CustomFactor]:
-    """Return a factor `e_i = t_i . (R z_i + t - S(u_i)) / sigma_i` for the detections of each pose.
+    """Build a factor `e_i = t_i . (R z_i + t - S(u_i)) / sigma_i` for the detections of each pose.
 
-    The rows are those of `station_rows`, at the stations u (m,) of cones with standard deviations
-    sigma_station (m,) along the curve, in m. The rest is as in `spline_projection_factors`.
+    The rows come from `station_rows`, at the stations u (m,) of cones with standard deviations sigma_station
+    (m,) along the curve, in m. All else is as in `spline_projection_factors`.
     """
     factors = []
     for own in _of_each_pose(pose_keys):
@@ -99,7 +99,7 @@ def station_factors(
 
 
 def _of_each_pose(pose_keys: IntArray) -> list[IntArray]:
-    """Return the rows (k,) of each pose, given the key (m,) of each row's pose."""
+    """Split rows by pose, given the key (m,) of each row's pose."""
     every = np.arange(len(pose_keys))
     return np.split(every, np.flatnonzero(np.diff(pose_keys)) + 1) if len(every) else []
 
@@ -123,11 +123,11 @@ class _Seen:
 
 
 Terms = tuple[Array, Array, Array, BoolArray, IntArray]
-"""Residuals, sigmas and derivatives of rows, which of them may contribute, and the slots of their keys."""
+"""Residuals, sigmas and derivatives of rows, whether they contribute, and the slots of their keys."""
 
 
 def _across(sigma_model: float, seen: _Seen, curve: Curve, values: gtsam.Values) -> Terms:
-    """Return the terms of detections across a curve."""
+    """Terms of detections across a curve."""
     placed, measured = seen.at(values)
     foot = curve.foot(values, placed[0])
     on_curve = foot.normal_unit, foot.distance, foot.basis
@@ -136,7 +136,7 @@ def _across(sigma_model: float, seen: _Seen, curve: Curve, values: gtsam.Values)
 
 
 def _along(u: Array, sigma_station: Array, seen: _Seen, curve: Curve, values: gtsam.Values) -> Terms:
-    """Return the terms of detections at stations along a curve."""
+    """Terms of detections at stations along a curve."""
     placed, measured = seen.at(values)
     basis, span = curve.tables.evaluate(u, 1)
     value, slope = np.ascontiguousarray(basis)
@@ -148,7 +148,7 @@ def _along(u: Array, sigma_station: Array, seen: _Seen, curve: Curve, values: gt
 def _detection_factor(
     seen: _Seen, curve: Curve, terms: Callable[[_Seen, Curve, gtsam.Values], Terms], huber: float
 ) -> gtsam.CustomFactor:
-    """Return the factor on the pose of the detections, the sensor's calibration and the control points."""
+    """Build the factor on the pose of the detections, the sensor's calibration and the control points."""
     sensor_keys = [] if seen.sensor_key is None else [int(seen.sensor_key)]
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:
@@ -178,11 +178,11 @@ def boundary_point_factor(
     low: Array,
     high: Array,
 ) -> gtsam.CustomFactor:
-    """Return the factor `e_i = n_i . (p_i - S(u_i)) / sigma_i`: a boundary passes through surveyed points.
+    """Build the factor `e_i = n_i . (p_i - S(u_i)) / sigma_i`: a boundary passes through surveyed points.
 
-    A surveyed point is, for example, the corner of a wall. points_map p (m, 2) are in the map frame and sigma
-    (m,) in m; u_i is the foot point of p_i in the stretch [low_i, high_i] of the curve. Keys and stretches
-    are as in `spline_projection_factors`. A row whose foot point is not interior contributes zero.
+    A surveyed point is, for example, the corner of a wall. points_map p (m, 2) are in the map frame, sigma
+    (m,) in m, and u_i is the foot point of p_i in the stretch [low_i, high_i] of the curve. Keys and
+    stretches are as in `spline_projection_factors`. A row whose foot point is not interior contributes zero.
     """
     _require_alike("points, sigmas and stretches", points_map, sigma, low, high)
     curve = Curve.of(control_keys, tables, low, high)
@@ -201,13 +201,13 @@ def boundary_point_factor(
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Stretches of a curve that a factor depends on, and the keys that matter there."""
+    """Stretches of a curve, and the control points that a factor on them depends on."""
 
-    keys: tuple[int, ...]  # of the control points `touched`
-    touched: IntArray  # indices of the control points whose keys are held
+    keys: tuple[int, ...]  # keys of the control points `touched`
+    touched: IntArray  # indices of the control points that matter in the stretches
     tables: SpanPolynomials
     low: Array
-    high: Array  # limits (m,) of the stretch where each foot point is searched for
+    high: Array  # limits (m,) of the stretch in which each foot point is searched
 
     @staticmethod
     def of(control_keys: Sequence[int], tables: SpanPolynomials, low: Array, high: Array) -> Curve:
@@ -220,7 +220,7 @@ class Curve:
         return Curve(tuple(int(control_keys[j]) for j in touched), touched, tables, low, high)
 
     def control_points(self, values: gtsam.Values) -> Array:
-        """Return the unwrapped control points (n, 2); those that do not matter here stay zero."""
+        """Return the unwrapped control points (n, 2); the ones that do not matter here stay zero."""
         size = self.tables.size
         distinct = np.zeros((size, 2))
         distinct[self.touched] = [values.atPoint2(key) for key in self.keys]
@@ -232,19 +232,19 @@ class Curve:
         return foot_points(self.tables, self.control_points(values), points, self.low, self.high, step)
 
     def usable(self, foot: FootPoints) -> tuple[BoolArray, IntArray]:
-        """Return which rows (m,) may contribute, and the slots (m, p + 1) of their control points' keys."""
+        """Return whether rows (m,) contribute, and the slots (m, p + 1) of their control points' keys."""
         slots = self.slots(foot.span)
         return foot.interior & (slots >= 0).all(axis=1), slots
 
     def slots(self, span: IntArray) -> IntArray:
-        """Return the slots (m, p + 1) of the keys of spans' (m,) control points, -1 where none is held."""
+        """Slots (m, p + 1) in `keys` of the control points of spans (m,), -1 for others."""
         size = self.tables.size
         slot_of = np.full(size, -1, dtype=np.intp)
         slot_of[self.touched] = np.arange(len(self.touched))
         return np.asarray(slot_of[(span[:, None] + np.arange(-self.tables.degree, 1)) % size])
 
     def by_key(self, by_control: Array, slots: IntArray) -> Array:
-        """Return derivatives by key (keys, m, d) from those by the points of each span (m, p + 1, d)."""
+        """Sum derivatives by the points of each span (m, p + 1, d) to derivatives by key (keys, m, d)."""
         blocks = np.zeros((len(self.touched), len(by_control), by_control.shape[2]))
         np.add.at(blocks, (slots, np.arange(len(by_control))[:, None]), by_control)
         return blocks
@@ -273,7 +273,7 @@ def _touched(tables: SpanPolynomials, low: Array, high: Array) -> IntArray:
 
 
 def fill(H: JacobianList, blocks: Sequence[Array]) -> None:
-    """Write every Jacobian to H; GTSAM does not check shapes, so they are checked here."""
+    """Write every Jacobian to H, after the checks of shapes that GTSAM leaves out."""
     if len(H) != len(blocks):
         raise ValueError(f"expected {len(H)} Jacobians, one a key, found {len(blocks)}")
     for i, block in enumerate(blocks):
@@ -285,9 +285,9 @@ def fill(H: JacobianList, blocks: Sequence[Array]) -> None:
 def spacing_factors(
     control_keys: Sequence[int], nominal: Array, sigma: Array, periodic: bool
 ) -> list[gtsam.RangeFactor2]:
-    """Return GTSAM's range factors `|c_{j+1} - c_j| - nominal_j` between neighbours.
+    """Build GTSAM's range factors `|c_{j+1} - c_j| - nominal_j` between neighbours.
 
-    nominal and sigma are in m and have k - 1 entries, or k where periodic. See `residuals.pair_residuals`.
+    nominal and sigma are in m and have k - 1 entries, or k if periodic. See `residuals.pair_residuals`.
     """
     expected = len(control_keys) - (0 if periodic else 1)
     if not len(nominal) == len(sigma) == expected:
@@ -302,7 +302,7 @@ def spacing_factors(
 def smoothness_factors(
     control_keys: Sequence[int], matrix: Array, sigma: float
 ) -> list[gtsam.LinearContainerFactor]:
-    """Return linear factors `D c ~ N(0, sigma^2)`, one for each row of D (`residuals.smoothness_matrix`)."""
+    """Build linear factors `D c ~ N(0, sigma^2)`, one for each row of D (`residuals.smoothness_matrix`)."""
     if matrix.shape[1] != len(control_keys):
         raise ValueError(f"expected a key for each of {matrix.shape[1]} columns, found {len(control_keys)}")
     factors = []
@@ -320,7 +320,7 @@ def smoothness_factors(
 def calibrated_odometry_factor(
     first_key: int, second_key: int, calibration_key: int, odometry: IntegratedOdometry
 ) -> gtsam.CustomFactor:
-    """Return the factor `Log(delta^-1 x_i^-1 x_j) + G b`, b (2,) the scale error and the yaw-rate bias."""
+    """Build the factor `Log(delta^-1 x_i^-1 x_j) + G b`, b (2,) the scale error and the yaw-rate bias."""
     keys, G = [int(first_key), int(second_key), int(calibration_key)], odometry.calibration_jacobian
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, H: JacobianList | None) -> Array:

@@ -1,4 +1,4 @@
-"""GTSAM's linear factors as arrays, and back again to the last bit."""
+"""Conversion of GTSAM's linear factors to arrays and back, without loss of a bit."""
 
 from collections.abc import Sequence
 
@@ -9,10 +9,10 @@ from .arrays import Array, IntArray
 
 
 def linear_factor(keys: IntArray, widths: IntArray, A: Array, b: Array) -> gtsam.GaussianConditional:
-    """Return the factor `1/2 |A x - b|^2` on any number of keys (k,), with whitened A (m, n) and b (m,).
+    """Build the factor `1/2 |A x - b|^2` on any number of keys (k,), with whitened A (m, n) and b (m,).
 
-    The binding's constructors take at most three keys. A Gaussian conditional has no such limit, and it is a
-    Jacobian factor.
+    The constructors of GTSAM's binding take at most three keys. A Gaussian conditional has no such limit, and
+    is a Jacobian factor.
     """
     if len(A) != len(b):
         raise ValueError(f"expected a matrix of {len(b)} rows, found {A.shape}")
@@ -32,22 +32,22 @@ def jacobian_matrix(factor: gtsam.JacobianFactor) -> Array:
 
 
 def jacobian_factor_of(keys: IntArray, widths: IntArray, matrix: Array) -> gtsam.JacobianFactor:
-    """Return the factor with the rows `[A b]` (m, n + 1) on keys (k,), whose variables have widths (k,)."""
+    """Build a factor with the rows `[A b]` (m, n + 1) on keys (k,) of variables with widths (k,)."""
     return gtsam.JacobianFactor(conditional_of(keys, widths, 1, matrix))
 
 
 def frontals_of(conditional: gtsam.GaussianConditional, widths: Sequence[int]) -> int:
     """Return the number of frontal keys of a conditional, given the widths (k,) of all its variables."""
-    size = conditional.R().shape[1]  # the view is not read, only its shape
+    size = conditional.R().shape[1]  # read the shape of the view only, not its entries
     return int(np.cumsum(widths).searchsorted(size)) + 1
 
 
 def conditional_of(
     keys: IntArray, widths: IntArray, frontals: int, matrix: Array
 ) -> gtsam.GaussianConditional:
-    """Return the conditional of the first `frontals` keys, with the rows `[A b]` (m, n + 1).
+    """Build the conditional of the first `frontals` keys, with the rows `[A b]` (m, n + 1).
 
-    ValueError where the numbers do not fit, which GTSAM does not check.
+    ValueError if keys, widths and matrix do not match, which GTSAM does not check.
     """
     _check_keys(keys, widths)
     if not 1 <= frontals <= len(keys):
@@ -63,10 +63,10 @@ def hessian_matrix(factor: gtsam.HessianFactor) -> Array:
 
 
 def hessian_factor_of(keys: IntArray, widths: IntArray, matrix: Array) -> gtsam.HessianFactor:
-    """Return the factor with `[[H, g], [g', f]]` (n + 1, n + 1) on keys (k,) of widths (k,).
+    """Build a factor with `[[H, g], [g', f]]` (n + 1, n + 1) on keys (k,) of widths (k,).
 
-    It is the sum of a factor for each block of H, in which each number is added to zeros alone, since the
-    binding's constructors take at most three keys. ValueError where the numbers do not fit.
+    The constructors of GTSAM's binding take at most three keys, so it is the sum of one factor for each block
+    of H. Blocks do not overlap: each entry is only added to zeros. ValueError if the arguments do not match.
     """
     _check_keys(keys, widths)
     size = int(widths.sum()) + 1

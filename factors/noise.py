@@ -1,4 +1,4 @@
-"""Noise: whitening, Huber's robust loss, and what was measured of a drive's odometry and detections."""
+"""Noise: whitening, Huber's robust loss, and noise measured on a drive's odometry and detections."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,51 +26,51 @@ def whiteners(covariances: Array) -> Array:
 
 
 def huber_weights(whitened: Array, threshold: float) -> Array:
-    """Return `w = min(1, threshold / |z|)`, the weight of each whitened residual z in a Gauss-Newton step.
+    """Weights `w = min(1, threshold / |z|)` of whitened residuals z in a Gauss-Newton step.
 
-    An infinite threshold gives least squares: every weight is 1.
+    An infinite threshold gives plain least squares: every weight is 1.
     """
     return 1.0 / np.maximum(np.abs(whitened) / threshold, 1.0)
 
 
 def huber_loss(whitened: Array, threshold: float) -> Array:
-    """Return Huber's loss of each whitened residual z with threshold k.
+    """Huber's loss of whitened residuals z with threshold k.
 
-    `rho(z) = z^2 / 2` where `|z| <= k`, and `k (|z| - k / 2)` beyond.
+    `rho(z) = z^2 / 2` for `|z| <= k`, and `k (|z| - k / 2)` beyond.
     """
     inner = np.minimum(np.abs(whitened), threshold)
     return np.asarray(inner * (np.abs(whitened) - 0.5 * inner))
 
 
 def huber_roots(whitened: Array, threshold: float) -> Array:
-    """Return `sign(z) sqrt(2 rho(z))`, whose half square is the loss rho of `huber_loss`."""
+    """`sign(z) sqrt(2 rho(z))`: half its square is the loss rho of `huber_loss`."""
     return np.sign(whitened) * np.sqrt(2.0 * huber_loss(whitened, threshold))
 
 
-SURE: Final = 4.0  # sigmas at which an error of the sensor is beyond doubt
-STAYS: Final = 1.5  # growth of the sigma of a cone's mean from which errors that stay count
+SURE: Final = 4.0  # sigmas from which an error of the sensor is significant
+STAYS: Final = 1.5  # growth of the sigma of a cone's mean from which correlated errors count
 
 
 @dataclass(frozen=True, eq=False)
 class RayNoise:
     """Error of a detection in one direction, along the ray or across it.
 
-    Its standard deviation is `sigma[0] + sigma[1] r` at range r. Two errors of one cone that are dt apart
+    Its standard deviation at range r is `sigma[0] + sigma[1] r`. Two errors of one cone, a time dt apart,
     have the correlation `share exp(-dt / time)`.
     """
 
     LENGTHS: ClassVar = {"sigma": (1, 0)}
 
     sigma: Array  # (2,) standard deviation at range 0 (m), and its growth with the range (m/m)
-    share: float = 0.0  # of the variance that stays with a cone for a while
-    time: float = 1.0  # correlation time of that share, s
+    share: float = 0.0  # correlated share of the variance
+    time: float = 1.0  # correlation time of that share (s)
 
     def sigmas(self, ranges: Array) -> Array:
-        """Return the standard deviation (m,) of single detections at ranges (m,), in m."""
+        """Standard deviations (m,) of single detections at ranges (m,), in m."""
         return np.asarray(self.sigma[0] + self.sigma[1] * ranges)
 
     def inflation(self, count: int, period: float) -> float:
-        """Return the variance of the mean of `count` errors of one cone by that of independent ones.
+        """Variance of the mean of `count` errors of one cone, relative to independent errors.
 
         Detections are `period` (s) apart: `1 + 2 sum_k (1 - k / count) share exp(-k period / time)`.
         """
@@ -78,9 +78,9 @@ class RayNoise:
         return float(1.0 + 2.0 * self.share * ((1.0 - k / count) * np.exp(-k * period / self.time)).sum())
 
     def inflation_of_slope(self, count: int, period: float) -> float:
-        """Return the variance of a slope over `count` errors of one cone by that of independent ones.
+        """Variance of a slope over `count` errors of one cone, relative to independent errors.
 
-        With the times g from their middle, and the correlations R, it is `g' R g / g' g`.
+        It is `g' R g / g' g`, with the times g from their middle and the correlations R.
         """
         times = period * (np.arange(count) - 0.5 * (count - 1))
         alike = self.share * np.exp(-np.abs(times[:, None] - times) / self.time)
@@ -89,7 +89,7 @@ class RayNoise:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredNoise:
-    """Noise of odometry and detections, measured from nothing but the readings of a drive."""
+    """Noise of odometry and detections, measured on the readings of a drive alone."""
 
     LENGTHS: ClassVar = {
         "odometry": (1, 1, 0),
@@ -101,25 +101,25 @@ class MeasuredNoise:
         "range_bend": -1,
     }
 
-    odometry: Array  # (3,) white noise of a twist from sample to sample: m/s, m/s, rad/s, one sigma
-    drift: Array  # (3,) slow part of its error as a random walk of the pose: m, m and rad by root of s
-    interval: float  # time between two twists, s
-    along: RayNoise | None = None  # along the ray; None where too few cones were seen often enough
+    odometry: Array  # (3,) standard deviation of a twist's white noise (m/s, m/s, rad/s)
+    drift: Array  # (3,) slow part of its error, a random walk of the pose (m, m and rad by root of s)
+    interval: float  # time between two twists (s)
+    along: RayNoise | None = None  # along the ray; None if too few cones were seen often enough
     across: RayNoise | None = None  # across the ray, as `along`
     count: int = 1  # median number of detections of one cone
-    period: float = 0.1  # time between two perception cycles, s
+    period: float = 0.1  # time between two perception cycles (s)
     per_cycle: float = 1.0  # mean number of cones seen in a cycle
     sensor: Array = field(default_factory=lambda: np.zeros(SENSOR_SIZE))
-    """(5,) Constant errors of the sensor (`factors.sensor:SENSOR`), while the odometry's scale is held."""
+    """(5,) Constant errors of the sensor (`factors.sensor:SENSOR`), given the odometry's scale."""
     sensor_sigma: Array = field(default_factory=lambda: np.full(SENSOR_SIZE, np.inf))
-    """(5,) Their standard deviations; infinite where nothing was measured."""
+    """(5,) Their standard deviations; infinite if not measured."""
     range_bend: float = 0.0
-    """Bend of the ranges (1/m), see `factors.sensor:by_bend`; 0 where it is not beyond doubt."""
-    seconds: float = 0.0  # time of driving that was measured on, s
+    """Bend of the ranges (1/m), see `factors.sensor:by_bend`; 0 if not significant."""
+    seconds: float = 0.0  # time of driving that the noise was measured on (s)
 
     @property
     def twist_sigma(self) -> Array:
-        """Return the white noise (3,) of a twist with the effect of white noise and slow part together."""
+        """White noise (3,) of a twist with the same effect as white noise and slow part together."""
         return np.asarray(np.hypot(self.odometry, self.drift / np.sqrt(self.interval)))
 
     @cached_property
@@ -128,9 +128,9 @@ class MeasuredNoise:
         return np.array([one.inflation(self.count, self.period) for one in known])
 
     def covariances(self, points: Array, *, inflated: bool) -> Array | None:
-        """Return the covariances (m, 2, 2) of detections at points (m, 2), vehicle frame; None if unknown.
+        """Covariances (m, 2, 2) of detections at points (m, 2), vehicle frame; None if not measured.
 
-        If `inflated`, they are so large that sightings of one cone count as independent ones.
+        They can be `inflated`, so that sightings of one cone count as independent.
         """
         if self.along is None or self.across is None:
             return None
@@ -142,9 +142,10 @@ class MeasuredNoise:
         return np.asarray(across[:, None, None] * np.eye(2) + (along - across)[:, None, None] * outer)
 
     def inflated(self, points: Array, covariances: Array) -> Array:
-        """Return covariances (m, 2, 2) of single detections so wide that errors that stay may be forgotten.
+        """Inflate covariances C (m, 2, 2) of single detections, so that sightings count as independent.
 
-        That is `G C G`, G with the roots of the inflations along and across the ray, if one exceeds `STAYS`.
+        The result is `G C G`, where G has the roots of the inflations along and across the ray. C does not
+        change unless one of them exceeds `STAYS`.
         """
         if self.along is None or self.across is None:
             return covariances
@@ -157,17 +158,17 @@ class MeasuredNoise:
 
     @cached_property
     def shown(self) -> Array:
-        """Errors (5,) of the sensor of more than `SURE` sigmas; the others are zero."""
+        """Significant errors (5,) of the sensor, of more than `SURE` sigmas; the others are zero."""
         return np.where(np.abs(self.sensor) > SURE * self.sensor_sigma, self.sensor, 0.0)
 
     def unbent(self, points: Array) -> Array:
-        """Return detections at points (m, 2), vehicle frame, with their ranges free of `range_bend`."""
+        """Remove `range_bend` from the ranges of detections at points (m, 2), vehicle frame."""
         if self.range_bend == 0.0:
             return points
         return points - self.range_bend * by_bend(points)[:, None] * points
 
     def corrected(self, points: Array, twist: Array, *, shown: bool = False) -> Array:
-        """Return detections at points (m, 2), vehicle frame, without all constant errors or those `shown`."""
+        """Remove all constant errors, or those `shown`, from detections at points (m, 2), vehicle frame."""
         errors, points = self.shown if shown else self.sensor, self.unbent(points)
         if not errors.any():
             return points
@@ -175,24 +176,24 @@ class MeasuredNoise:
 
 
 def ray_axes(points: Array) -> Array:
-    """Return the unit vectors (m, 2, 2) along and across the rays to points (m, 2), vehicle frame."""
+    """Unit vectors (m, 2, 2) along and across the rays to points (m, 2), vehicle frame."""
     ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
     return np.stack([ray, left_of(ray)], axis=1)
 
 
 def ray_sigmas(points: Array, covariances: Array) -> Array:
-    """Return the standard deviations (m, 2) along and across the rays to points (m, 2), vehicle frame."""
+    """Standard deviations (m, 2) along and across the rays to points (m, 2), vehicle frame."""
     axes = ray_axes(points)
     return np.asarray(np.sqrt(np.einsum("mki,mij,mkj->mk", axes, covariances, axes)))
 
 
 @dataclass(frozen=True, eq=False)
 class KnownNoise:
-    """What is known of the noise before a drive."""
+    """Noise as known before a drive."""
 
     LENGTHS: ClassVar = {"odometry": (1, 1, 0), "measured": 0}
 
-    odometry: Array  # (3,) standard deviation of a twist (m/s, m/s, rad/s): stated or assumed
+    odometry: Array  # (3,) standard deviation of a twist (m/s, m/s, rad/s), stated or assumed
     odometry_stated: bool = True
-    detections_stated: bool = True  # whether the covariances of the detections were stated
-    measured: MeasuredNoise | None = None  # on this drive as a whole, or on an earlier one
+    detections_stated: bool = True  # whether the log states the covariances of the detections
+    measured: MeasuredNoise | None = None  # on the whole of this drive, or on an earlier one

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-import scipy  # which imports its modules when they are used
+import scipy  # imports its modules on first use
 
 from .arrays import Array
 from .bspline import scatter
@@ -13,7 +13,7 @@ from .se2 import in_vehicle, to_vehicle
 
 @dataclass(frozen=True)
 class ProjectionRows:
-    """A row for each detection: residual, standard deviation and Jacobian blocks, not whitened."""
+    """One row for each detection, not whitened: residual, standard deviation and Jacobian blocks."""
 
     residual: Array  # (m,) signed distance of the detection from the curve, in m, positive left of travel
     sigma: Array  # (m,) standard deviation of the detection across the curve, in m
@@ -22,12 +22,12 @@ class ProjectionRows:
 
 
 def chi2_quantile(probability: float, degrees: int) -> float:
-    """Return the chi-square quantile; importing `scipy.stats` for it would dominate the start-up time."""
+    """Chi-square quantile; importing `scipy.stats` for it would dominate the start-up time."""
     return 2.0 * float(scipy.special.gammaincinv(0.5 * degrees, probability))
 
 
 def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: float) -> Array:
-    """Return `sqrt(n^T R K R^T n + sigma_model^2)` (m,), the sigma of each detection across the curve, in m.
+    """Standard deviations `sqrt(n^T R K R^T n + sigma_model^2)` (m,) of detections across the curve, in m.
 
     normals n (m, 2) are in the map frame, covariances K (m, 2, 2) in the vehicle frame of each row's pose
     (m, 3).
@@ -42,15 +42,16 @@ def sigma_across(normals: Array, covariances: Array, poses: Array, sigma_model: 
 def project(
     points_map: Array, covariances: Array, poses: Array, foot: FootPoints, sigma_model: float
 ) -> ProjectionRows:
-    """Return `r = n . (p - S(u))` with u the foot point of `p = R z + t` (paper: Update).
+    """Linearize `r = n . (p - S(u))` with u the foot point of `p = R z + t` (paper: Update).
 
     points_map p (m, 2) are in m, covariances (m, 2, 2) in the vehicle frame of each row's pose (m, 3). At an
-    interior foot point `p - S` is along n while `S'` and `dn/du` are along the tangent. So every term through
+    interior foot point `p - S` is along n, and `S'` and `dn/du` are along the tangent. So every term through
     u vanishes, and with J the quarter turn
 
         dr/dt = n,   dr/dtheta = n . (J R z),   dr/dc_j = -beta_j(u) n
 
-    are exact at any distance from the curve. Elsewhere they are not: leave out what is not `foot.interior`.
+    are exact at any distance from the curve. They do not hold elsewhere: drop rows that are not
+    `foot.interior`.
     """
     n = foot.normal_unit
     arm = points_map - poses[:, :2]
@@ -73,9 +74,9 @@ class LandmarkResiduals:
 
 
 def landmark_residuals(poses: Array, landmarks: Array, points_vehicle: Array) -> LandmarkResiduals:
-    """Return `r = R^T (l - t) - z` of poses (m, 3), landmarks l (m, 2), map frame, and detections z (m, 2).
+    """Linearize `r = R^T (l - t) - z` for poses (m, 3), landmarks l (m, 2) and detections z (m, 2).
 
-    The detections are in the vehicle frame, all in m. The derivatives are
+    Poses and landmarks are in the map frame, detections in the vehicle frame, all in m. The derivatives are
 
         dr/dt = -R^T,   dr/dtheta = (a_y, -a_x) with a = R^T (l - t),   dr/dl = R^T
     """
@@ -88,9 +89,9 @@ def landmark_residuals(poses: Array, landmarks: Array, points_vehicle: Array) ->
 
 
 def pair_residuals(first: Array, second: Array, nominal: Array) -> tuple[Array, Array]:
-    """Return `r_j = |b_j - a_j| - nominal_j` (k,) of points a, b (k, 2), and directions (k, 2), in m.
+    """Return `r_j = |b_j - a_j| - nominal_j` (k,) of points a, b (k, 2) in m, and the derivatives by b_j.
 
-    dr/db_j = -dr/da_j is the direction, which is zero for coinciding points.
+    `dr/db_j = -dr/da_j` (k, 2) is the direction from a_j to b_j, and zero for coinciding points.
     """
     offset = second - first
     length = np.hypot(offset[:, 0], offset[:, 1])
@@ -98,29 +99,29 @@ def pair_residuals(first: Array, second: Array, nominal: Array) -> tuple[Array, 
 
 
 def smoothness_coefficients(abscissae: Array, period: float | None, spacing: float | None = None) -> Array:
-    """Return second divided differences over abscissae (m,), times the squared spacing: (m - 2, 3).
+    """Coefficients (m - 2, 3) of second divided differences over abscissae (m,), times the squared spacing.
 
-    Row j holds the coefficients of the points j, j + 1 and j + 2, which give zero for points on a straight
-    line whatever their spacing. A curve that is closed after `period` has m rows. The default spacing is the
-    mean gap of the abscissae.
+    Row j has the coefficients of the points j, j + 1 and j + 2. They give zero for points on a straight line,
+    whatever their spacing. A curve that is closed after `period` has m rows. The default spacing is the mean
+    gap of the abscissae.
     """
     m = len(abscissae)
     extended = abscissae if period is None else np.concatenate([abscissae, abscissae[:2] + period])
     gaps = np.diff(extended)
-    mean = gaps[:m].mean() if spacing is None else spacing  # the period repeats one gap, which counts once
+    mean = gaps[:m].mean() if spacing is None else spacing  # count the gap that the period repeats once
     before, after = gaps[:-1], gaps[1:]
     scale = 2.0 * mean**2 / (before + after)
     return np.column_stack([scale / before, -scale / before - scale / after, scale / after])
 
 
 def smoothness_matrix(abscissae: Array, period: float | None) -> Array:
-    """Return the matrix D (m - 2, m), or (m, m) for a closed curve, of `smoothness_coefficients`."""
+    """Matrix D (m - 2, m), or (m, m) for a closed curve, of `smoothness_coefficients`."""
     coefficients = smoothness_coefficients(abscissae, period)
     return scatter(coefficients, np.arange(len(coefficients)), len(abscissae), periodic=True)
 
 
 def greville(knots: Array, degree: int) -> Array:
-    """Return the Greville abscissae `(t_{j+1} + ... + t_{j+p}) / p` (n,), where control points act most."""
+    """Greville abscissae `(t_{j+1} + ... + t_{j+p}) / p` (n,), where control points act most."""
     n = len(knots) - degree - 1
     windows = np.lib.stride_tricks.sliding_window_view(knots[1:-1], degree)
     return np.asarray(windows[:n].mean(axis=1))

@@ -10,39 +10,40 @@ from .arrays import Array
 
 
 def wrap_angle(angle: Array) -> Array:
-    """Return each angle (rad) wrapped to (-pi, pi]."""
+    """Wrap angles (rad) to (-pi, pi]."""
     return -((np.pi - angle) % (2.0 * np.pi) - np.pi)
 
 
 def rotation(theta: float) -> Array:
-    """Return R(theta) (2, 2), which turns a vector from the vehicle frame to the map frame."""
+    """Rotation matrix R(theta) (2, 2) from the vehicle frame to the map frame."""
     c, s = cos(theta), sin(theta)
     return np.array([[c, -s], [s, c]])
 
 
 def rotations(theta: Array) -> Array:
-    """Return R(theta) (m, 2, 2) of each angle (m,)."""
+    """Rotation matrices R(theta) (m, 2, 2) of angles (m,)."""
     c, s = np.cos(theta), np.sin(theta)
     return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
 
 
 def rotated(covariances: Array, theta: Array) -> Array:
-    """Return `R K R'` (m, 2, 2) of covariances K (m, 2, 2), with R(theta) of each angle (m,)."""
+    """Rotate covariances K (m, 2, 2) by angles (m,): `R K R'`."""
     turn = rotations(theta)
     return np.asarray(turn @ covariances @ turn.transpose(0, 2, 1))
 
 
 def left_of(vectors: Array) -> Array:
-    """Return vectors (n, 2) turned by a quarter to the left: (x, y) becomes (-y, x)."""
+    """Turn vectors (n, 2) by a quarter to the left: (x, y) becomes (-y, x)."""
     turned = np.empty_like(vectors)
-    turned[:, 0], turned[:, 1] = -vectors[:, 1], vectors[:, 0]
+    turned[:, 0] = -vectors[:, 1]
+    turned[:, 1] = vectors[:, 0]
     return turned
 
 
 def compose(pose: Array, delta: Array) -> Array:
-    """Return `pose * delta` on SE(2), for one pose (3,) or row by row (k, 3).
+    """Compose `pose * delta` on SE(2), for one pose (3,) or row by row (k, 3).
 
-    Headings are added and not wrapped, so that whole turns accumulate.
+    Headings are not wrapped, so that whole turns accumulate.
     """
     if pose.ndim == delta.ndim == 1:
         (x, y, theta), (dx, dy, turn) = pose.tolist(), delta.tolist()
@@ -54,49 +55,49 @@ def compose(pose: Array, delta: Array) -> Array:
 
 
 def inverse(pose: Array) -> Array:
-    """Return the pose (3,) with `pose * inverse = 0`; its heading is not wrapped."""
+    """Inverse (3,) of a pose on SE(2); its heading is not wrapped."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return np.array([-c * pose[0] - s * pose[1], s * pose[0] - c * pose[1], -pose[2]])
 
 
 def relative(pose: Array, other: Array) -> Array:
-    """Return `pose^-1 * other` (3,) on SE(2); its heading is not wrapped."""
+    """Relative pose `pose^-1 * other` (3,) on SE(2); its heading is not wrapped."""
     return np.append(rotation(pose[2]).T @ (other[:2] - pose[:2]), other[2] - pose[2])
 
 
 def move_points(motion: Array, points: Array) -> Array:
-    """Return `R p + t` (m, 2): points (m, 2) after the rigid motion (3,) of the map frame."""
+    """Move points p (m, 2) by a rigid motion (3,) of the map frame: `R p + t`."""
     return np.asarray(points @ rotation(motion[2]).T + motion[:2])
 
 
 def path_lengths(path: Array) -> Array:
-    """Return the length (n,) of a path from its first point (n, 2), or pose (n, 3), to each of them (m)."""
+    """Length (n,) of a path from its first point (n, 2), or pose (n, 3), to each one (m)."""
     return np.append(0.0, np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T)))
 
 
 to_map: Final = kernels.to_map
-"""`p = R z + t` (m, 2), map frame: points z (m, 2) in the vehicle frames of poses (m, 3)."""
+"""Transform points z (m, 2) from the vehicle frames of poses (m, 3) to the map frame: `p = R z + t`."""
 
 
 def in_vehicle(directions: Array, poses: Array) -> Array:
-    """Return vectors (m, 2), map frame, in the vehicle frames of poses (m, 3)."""
+    """Rotate vectors (m, 2) from the map frame to the vehicle frames of poses (m, 3)."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     x, y = directions[:, 0], directions[:, 1]
     return np.array([c * x + s * y, -s * x + c * y]).T
 
 
 def to_vehicle(points_map: Array, poses: Array) -> Array:
-    """Return `z = R^T (p - t)` (m, 2): points p (m, 2), map frame, in the vehicle frames of poses (m, 3)."""
+    """Transform points p (m, 2) from the map frame to vehicle frames of poses (m, 3): `z = R^T (p - t)`."""
     return in_vehicle(points_map - poses[:, :2], poses)
 
 
 def se2_exp(tangents: Array) -> Array:
-    """Return the exponential of SE(2), row by row: relative poses (k, 3).
+    """Exponential map of SE(2): relative poses (k, 3) of tangents (k, 3).
 
-    Each row of tangents (k, 3) is a twist `(vx, vy, wz)` times its duration, in m, m and rad.
+    A tangent is a twist `(vx, vy, wz)` times its duration, in m, m and rad.
     """
     x, y, theta = tangents.T
-    half = np.where(theta == 0.0, np.finfo(float).tiny, 0.5 * theta)  # so that sin(half) / half is 1
+    half = np.where(theta == 0.0, np.finfo(float).tiny, 0.5 * theta)  # avoid 0 / 0: sin(half) / half is 1
     sine, cosine = np.sin(half), np.cos(half)
     sinc, cosc = sine * cosine / half, sine * sine / half
     return np.array([sinc * x - cosc * y, cosc * x + sinc * y, theta]).T

@@ -1,6 +1,6 @@
-"""The sensor's constant errors: a turned or shifted sensor, late stamps, and a range that reads wrong.
+"""Calibration of the sensor: yaw, lateral offset, latency, and scale and bias of the ranges.
 
-All five are estimated along with the map. They are small, so a detection is corrected linearly in them.
+All five are estimated along with the map. They are small, so detections are corrected to first order.
 """
 
 import numpy as np
@@ -10,22 +10,23 @@ from .arrays import Array
 from .se2 import left_of
 
 SENSOR = ("yaw", "lateral", "latency", "range_scale", "range_bias")
-"""Entries of the calibration b: yaw (rad) and lateral offset (m), positive to the left, age of detections at
-their stamps (s), scale error (-) and bias (m) of ranges."""
+"""Entries of the calibration b: yaw (rad) and lateral offset (m), positive to the left; age of detections at
+their stamps (s); scale error (-) and bias (m) of the ranges."""
 SENSOR_SIZE = len(SENSOR)
-RANGE = slice(3, 5)  # errors of the ranges
-BENDS_FROM = 8.0  # range from which on ranges may bend: cones beside the vehicle are nearer (m)
+RANGE = slice(3, 5)  # entries that are errors of the ranges
+BENDS_FROM = 8.0  # range from which ranges may bend (m); cones beside the vehicle are nearer
 
 
 def by_sensor(points_vehicle: Array, twists: Array) -> Array:
-    """Return the derivatives C (m, 2, 5) of corrected detections `z + C b` by the sensor's calibration b.
+    """Derivatives C (m, 2, 5) of corrected detections `z + C b` by the sensor's calibration b.
 
-    z are points_vehicle (m, 2) as measured, in m, and twists (m, 3) are those at their stamps (m/s, m/s,
-    rad/s). With J the quarter turn and `v + wz J z` the motion relative to a point at rest, the columns are
+    points_vehicle z (m, 2) are the measured positions in m, twists (m, 3) the vehicle's at their stamps (m/s,
+    m/s, rad/s). With J the quarter turn and `v + wz J z` the motion relative to a point at rest, the columns
+    are
 
         J z (yaw),   (0, 1) (lateral),   -(v + wz J z) (latency),   -z (range scale),   -z / |z| (range bias)
 
-    The second order is left out: a yaw of 2 degrees shifts a detection at 15 m by 9 mm beside that.
+    The second order is neglected: for a yaw of 2 degrees it is 9 mm at 15 m.
     """
     turned = left_of(points_vehicle)
     distance = np.maximum(np.hypot(points_vehicle[:, 0], points_vehicle[:, 1]), np.finfo(float).tiny)
@@ -39,26 +40,26 @@ def by_sensor(points_vehicle: Array, twists: Array) -> Array:
 
 
 def by_bend(points_vehicle: Array) -> Array:
-    """Return the derivative (m,) of `|z'| / |z|` by the bend k of the ranges, for detections z (m, 2).
+    """Derivative (m,) of `|z'| / |z|` by the bend k of the ranges, for detections z (m, 2).
 
-    A range r beyond b = `BENDS_FROM` reads `k (r - b)^2` too long, so the derivative is `(r - b)^2 / r`.
-    Such an error of the depth grows by the square: that of a detector whose scale and bias fit near cones.
+    A range r beyond b = `BENDS_FROM` is measured too long by `k (r - b)^2`: the derivative is `(r - b)^2 /
+    r`. It models a detector whose scale and bias fit near cones, and whose depth error grows with the square.
     """
     distance = np.hypot(points_vehicle[:, 0], points_vehicle[:, 1])
     return np.asarray(np.maximum(distance - BENDS_FROM, 0.0) ** 2 / np.maximum(distance, BENDS_FROM))
 
 
 def corrected(measured: Array, twists: Array, sensor: Array) -> Array:
-    """Return the detections `z + C b` (m, 2), or z as measured where the calibration b (5,) is empty."""
+    """Correct detections z (m, 2) by the calibration b (5,) to `z + C b`; an empty b changes nothing."""
     return kernels.shifted(measured, twists, sensor) if len(sensor) else measured
 
 
 def by_range(points_vehicle: Array) -> Array:
-    """Return the derivatives (m, 2, 2, 2) of `M^-1` by the range scale and by the range bias.
+    """Derivatives (m, 2, 2, 2) of `M^-1` by the range scale and by the range bias.
 
-    M is the derivative of a corrected detection by the measured one, z (m, 2). Noise is stated for measured
-    detections, so a residual r of a corrected one counts as `M^-1 r`; otherwise least squares would shrink
-    the world. The derivatives are
+    M is the derivative of a corrected detection by the measured one, z (m, 2). Covariances are stated for
+    measured detections, so a residual r of a corrected one counts as `M^-1 r`. Without this, least squares
+    would shrink the world. The derivatives are
 
         I (range scale),   (I - z z' / |z|^2) / |z| (range bias)
     """
@@ -73,9 +74,9 @@ def by_range(points_vehicle: Array) -> Array:
 def restored(residual: Array, measured: Array, twists: Array, sensor: Array) -> tuple[Array, Array]:
     """Return `M^-1` (m, 2, 2) and the derivatives of `M^-1 r` (m, 2, 5) by the sensor's calibration.
 
-    r (m, 2) are the expected minus the corrected detections, vehicle frame, measured at (m, 2) with twists
-    (m, 3). The derivatives are `-M^-1 C`, and `d M^-1 r` for the errors of the ranges. For an empty
-    calibration, M is the identity, and the derivatives are (m, 2, 0).
+    residual r (m, 2) is the expected minus the corrected detection, vehicle frame; measured (m, 2) and twists
+    (m, 3) are as in `by_sensor`. The derivatives are `-M^-1 C`, plus `dM^-1 r` for the errors of the ranges.
+    For an empty calibration M is the identity, and the derivatives are (m, 2, 0).
     """
     if len(sensor) == 0:
         return np.tile(np.eye(2), (len(measured), 1, 1)), np.zeros((len(measured), 2, 0))

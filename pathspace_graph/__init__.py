@@ -34,7 +34,7 @@ __all__ = [
     "split_odometry", "write_log", "write_result",
 ]  # fmt: skip
 
-# imported when first asked for: the command line's help, and sim, need no estimator
+# imported at first access: help of the command line and sim need no estimator
 _HOMES = {
     "batch.mapper": ("BatchMapper",),
     "baselines.filters": ("CkfMapper", "LandmarkCkf"),

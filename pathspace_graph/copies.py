@@ -1,6 +1,9 @@
-"""Shallow copies of objects, which are made in every cycle."""
+"""Copies of mutable objects, which a mapper makes in every cycle."""
 
-from typing import TypeVar
+from functools import cache
+from typing import Any, Self, TypeVar
+
+import numpy as np
 
 T = TypeVar("T")
 
@@ -10,3 +13,27 @@ def shallow(one: T) -> T:
     other = object.__new__(type(one))
     vars(other).update(vars(one))
     return other
+
+
+class Copyable:
+    """Base of classes whose methods replace arrays and never write into them, so that copies share them."""
+
+    def copy(self) -> Self:
+        """Return a copy that can change independently: it copies every attribute that has a `copy`."""
+        other = shallow(self)
+        attributes = vars(other)
+        for name, value in attributes.items():
+            if _is_mutable(value.__class__):
+                attributes[name] = _copied(value)
+        return other
+
+
+@cache  # a copy of a mapper asks it two hundred times
+def _is_mutable(kind: type) -> bool:
+    return hasattr(kind, "copy") and not issubclass(kind, np.ndarray | np.generic)
+
+
+def _copied(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value.copy()
+    return {key: own.copy() if _is_mutable(own.__class__) else own for key, own in value.items()}

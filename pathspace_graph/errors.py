@@ -1,4 +1,4 @@
-"""The few exceptions of this library; the command line turns each into one line and exit code 2 or 3."""
+"""The exceptions of this library; the command line turns each into one line and exit code 2 or 3."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -9,11 +9,11 @@ from typing import Any, Final, Self
 
 
 class PathspaceError(Exception):
-    """Base of all errors that a user can fix: one line of what was expected and what was found."""
+    """Base of all errors that a user can fix; one line says what was expected and what was found."""
 
 
 class InputError(PathspaceError):
-    """A missing or wrong file; the text names it, the row (1 is the first line) and what was expected."""
+    """A missing or invalid file; the text names file, row (from 1) and what was expected."""
 
     def __init__(self, file: Path | str, message: str, row: int | None = None) -> None:
         self.file = Path(file)
@@ -24,46 +24,46 @@ class InputError(PathspaceError):
 
 
 class ReadingError(PathspaceError):
-    """A perception cycle that cannot be used and changes nothing; the text names field and row, from 0."""
+    """An unusable perception cycle, which changes nothing; the text names field and row (from 0)."""
 
     def __init__(
         self, field: str, expected: str, found: object, row: int | None = None, t: float | None = None
     ) -> None:
         self.field, self.expected, self.found, self.row = field, expected, found, row
-        self.t = t  # stamp of the cycle (s), where it has one
+        self.t = t  # stamp of the cycle (s), if it has one
         when = "" if t is None else f"cycle at {t:.12g} s: "
         where = field if row is None else f"{field}, row {row}"
         value = f"{found:.12g}" if isinstance(found, float) else str(found)
         super().__init__(f"{when}{where}: expected {expected}, found {value}")
 
     def at(self, t: float) -> Self:
-        """Return the same error of the cycle with this stamp (s)."""
+        """Return the error with the stamp t (s) of its cycle."""
         return type(self)(self.field, self.expected, self.found, self.row, t)
 
     def __reduce__(self) -> tuple[type[Self], tuple[object, ...]]:
-        """Return how to make the error again: it comes back from worker processes."""
+        """Pickle the error for worker processes."""
         return type(self), (self.field, self.expected, self.found, self.row, self.t)
 
 
 class OutputError(PathspaceError):
-    """An output path that cannot be written without losing something that is there already."""
+    """An output path that cannot be written without losing existing files."""
 
 
 class SettingsError(PathspaceError):
-    """A setting out of its range, or the name of something unknown."""
+    """A setting out of its range, or an unknown name."""
 
 
 class SolveError(PathspaceError):
-    """An estimate that cannot be computed, though nothing is wrong with the input; exit code 3."""
+    """An estimate that cannot be computed from valid input; exit code 3."""
 
 
 class SingularSystemError(SolveError):
-    """Normal equations that are not positive definite, since nothing determines some variable."""
+    """Normal equations that are not positive definite: some variable is not observable."""
 
 
 @contextmanager
 def solving(what: str) -> Iterator[None]:
-    """Turn whatever numerics raise within the context into a SolveError about `what`."""
+    """Convert any other exception in the context to a SolveError about `what`."""
     try:
         yield
     except PathspaceError:
@@ -72,12 +72,12 @@ def solving(what: str) -> Iterator[None]:
         raise SolveError(f"{what} has failed: {type(error).__name__}: {error}") from error
 
 
-LEAST_BEGIN: Final = 3  # number of letters from which a beginning may stand for a name
-NAME_SIMILARITY: Final = 0.6  # least similarity (0 to 1) of a name that may have been meant
+LEAST_BEGIN: Final = 3  # least number of letters of a prefix that suggests a name
+NAME_SIMILARITY: Final = 0.6  # least similarity (0 to 1) of a suggested name
 
 
 def check_name(name: Any, known: Iterable[str], expected: str) -> None:
-    """Raise a SettingsError that names the nearest known name, if one is near, unless `name` is known."""
+    """Raise a SettingsError for an unknown name, with the nearest known one, if any is near."""
     known = list(known)
     if name in known:
         return
@@ -88,14 +88,14 @@ def check_name(name: Any, known: Iterable[str], expected: str) -> None:
 
 
 def check_type(name: str, value: object, kind: type[Any]) -> None:
-    """Raise a SettingsError that names an argument, unless its value is of the type."""
+    """Raise a SettingsError for an argument that is not of a type."""
     if not isinstance(value, kind):
         found = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
         raise SettingsError(f"{name}: expected {article} {kind.__name__}, found {found}")
 
 
-NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {  # checks of numbers, by the words of the message
+NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {  # checks of numbers, by the words of their message
     "a positive number": lambda value: 0 < value < inf,
     "a number of at least 0": lambda value: 0 <= value < inf,
     "a number in [0, 1]": lambda value: 0 <= value <= 1,
@@ -104,7 +104,7 @@ NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {  # checks of numbers, by th
 
 
 def check_numbers(settings: object, group: str, names: Iterable[str], expected: str) -> None:
-    """Raise a SettingsError for the first of these settings that is not as `expected`, a key of NUMBERS."""
+    """Raise a SettingsError for the first of these settings that fails a check of NUMBERS."""
     for name in names:
         value = getattr(settings, name)
         if not NUMBERS[expected](value):

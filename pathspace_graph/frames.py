@@ -1,4 +1,4 @@
-"""Data frames for pandas: a run, its cycles, and the runs of a study, which xarray has as well."""
+"""Data frames of runs and studies for pandas, and data sets for xarray."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     import xarray
 
 OPTIONAL: Final = ("offered", "health", "reason", "dropped")  # columns of `cycles.csv` that may be missing
-RESULTS_FILE: Final = "results.csv"  # file of a study's metrics, a row for each run and lap
-TIMES_FILE: Final = "times.csv"  # file of a study's wall times, in the same rows
-KEYS: Final = ("study", "track", "seed", "noise", "estimator", "variant", "lap")  # which tell rows apart
+RESULTS_FILE: Final = "results.csv"  # metrics of a study, a row per run and lap
+TIMES_FILE: Final = "times.csv"  # wall times of a study, with the same rows
+KEYS: Final = ("study", "track", "seed", "noise", "estimator", "variant", "lap")  # keys of a row
 TEXTS: Final = ("study", "track", "noise", "estimator", "variant", "failure", "notices", "drive", "cell")
-"""Columns of a study that are text, also where it looks like a number."""
+"""Text columns of a study, even if a value looks like a number."""
 DIMENSIONS: Final = KEYS[1:]  # dimensions of a study's metrics
 
 
 def read_cycles(folder: Path | str) -> pd.DataFrame:
-    """Return the cycles (s) of a run's folder, with the cycle as index; an InputError on a wrong file."""
+    """Read the cycles of a run's folder, with the cycle as index; InputError on a wrong file."""
     file = Path(folder) / CYCLES_FILE
     table = read_table(file, [name for name in CYCLE_COLUMNS if name not in OPTIONAL])
     columns = {name: _column(table, name, CYCLE_COLUMNS.get(name, "str")) for name in table.columns}
@@ -43,17 +43,16 @@ def _column(table: Table, name: str, kind: str) -> pd.Series:
 
 
 def run_frame(result: RunResult) -> pd.DataFrame:
-    """Return the cycles of a run as `read_cycles` does, each with its pose x, y (m) and theta (rad)."""
+    """Return the cycles of a run as in `read_cycles`, with the pose x, y (m) and theta (rad)."""
     columns = {name: [getattr(record, name) for record in result.cycles] for name in CYCLE_COLUMNS}
     frame = pd.DataFrame(columns).astype({name: CYCLE_COLUMNS[name] for name in columns}).set_index("cycle")
     return frame.assign(**dict(zip(("x", "y", "theta"), result.trajectory.T, strict=True)))
 
 
 def read_study(folder: Path | str) -> pd.DataFrame:
-    """Return the runs of a study from the folder that `ablate` wrote: a tidy row for each run and lap.
+    """Read a study written by `ablate`, with metrics and wall times: a tidy row per run and lap.
 
-    The metrics come with the wall times. A run that failed has one row without a lap or metrics, and its
-    `failure`. InputError on a wrong file.
+    A failed run has one row with its `failure`, without lap and metrics. InputError on a wrong file.
     """
     results, times = (_table(Path(folder) / name) for name in (RESULTS_FILE, TIMES_FILE))
     keys = list(KEYS)
@@ -65,8 +64,8 @@ def read_study(folder: Path | str) -> pd.DataFrame:
 
 
 def _table(file: Path) -> pd.DataFrame:
-    """Return a file of a study; empty texts stay empty, and empty numbers are NaN."""
-    read_table(file, KEYS)  # which says what is wrong with it
+    """Read a file of a study; empty texts stay empty, and empty numbers are NaN."""
+    read_table(file, KEYS)  # raises an InputError on a wrong file
     frame = pd.read_csv(file, dtype=dict.fromkeys(TEXTS, "str"), keep_default_na=False, na_values=[""])
     flags = [name for name in frame if name not in TEXTS and frame[name].dropna().isin([True, False]).all()]
     flags = [name for name in flags if frame[name].dtype.kind not in "fiu"]
@@ -75,10 +74,10 @@ def _table(file: Path) -> pd.DataFrame:
 
 
 def to_dataset(study: pd.DataFrame) -> xarray.Dataset:
-    """Return the numbers of a study as a Dataset with the dimensions DIMENSIONS; what is true is 1.
+    """Return the numbers of a study as a Dataset with the dimensions DIMENSIONS; True becomes 1.
 
-    Where a run failed or was not made its values are NaN. Texts that are the same in every row, such as the
-    versions, are attributes. SettingsError where xarray is not installed.
+    Values of failed and missing runs are NaN. Texts that are equal in all rows, such as versions, become
+    attributes. SettingsError if xarray is not installed.
     """
     if find_spec("xarray") is None:
         raise SettingsError("to_dataset: expected xarray (pip install -e '.[frames]'), found none")

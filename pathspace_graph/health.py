@@ -1,13 +1,13 @@
-"""Health: how far an online estimate can be trusted, cycle by cycle, with a reason in plain words."""
+"""Health of an online estimate: good, degraded or lost in each cycle, with a reason."""
 
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from math import nan
-from typing import ClassVar, Final, Self
+from typing import ClassVar, Final
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 
 from .labels import BOUNDARIES, NAMES
 from .lengths import Length, Text
@@ -17,61 +17,55 @@ DEGRADED: Final = "degraded"
 LOST: Final = "lost"
 CONDITIONS: Final = (GOOD, DEGRADED, LOST)
 
-# A coloured detection in the view of the curves is explained if it is in use, or lies on a closed curve of
-# its colour farther along: in a hairpin the sensor sees the next stretch across the infield.
-WINDOW: Final = 1.0  # age up to which detections are judged together (s)
-MIN_OFFERED: Final = 12  # least number of detections that are judged, older ones if the window holds fewer
-BLIND: Final = 2.0  # time without detections from which on the estimate is degraded (s)
-SHARE_DEGRADED: Final = 0.8  # share of explained detections on a closed map, below which it is degraded
-SHARE_LOST: Final = 0.55  # the same share below which the vehicle is lost
-OPEN_DEGRADED: Final = 0.35  # the same on an open map, low since much of what is seen is not mapped yet
+# A coloured detection in view of the curves is explained if it is in use, or lies on a closed curve of its
+# colour farther along: in a hairpin the sensor sees the next stretch across the infield.
+WINDOW: Final = 1.0  # time over which detections are judged together (s)
+MIN_OFFERED: Final = 12  # least number of judged detections, with older ones if necessary
+BLIND: Final = 2.0  # longest time without detections of a good estimate (s)
+SHARE_DEGRADED: Final = 0.8  # least share of explained detections of a good estimate on a closed map
+SHARE_LOST: Final = 0.55  # share below which the vehicle is lost on a closed map
+OPEN_DEGRADED: Final = 0.35  # least share on an open map, where much in view is not mapped yet
 MAX_INNOVATION: Final = 1.2  # mean squared normalized innovation of a good estimate; one sigma is added
-SIGMA_DEGRADED: Final = 1.0  # standard deviation of the position on a closed map, beyond which (m)
-SIGMA_LOST: Final = 5.0  # the same beyond which the vehicle is lost (m)
+SIGMA_DEGRADED: Final = 1.0  # largest standard deviation of a good position on a closed map (m)
+SIGMA_LOST: Final = 5.0  # standard deviation beyond which the vehicle is lost (m)
 
 
 @dataclass(frozen=True)
 class Health:
-    """How far the estimate of a cycle can be trusted."""
+    """Health of the estimate in a cycle."""
 
     LENGTHS: ClassVar = {"reason": 0}
 
     condition: str = ""  # good, degraded or lost; empty without a monitor
-    reason: str = ""  # why the condition is not good
+    reason: str = ""  # reason, if the condition is not good
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a cycle's detections say about the estimate, before they change it."""
+    """Evidence of a cycle's detections on the estimate, before the update."""
 
     t: float  # stamp of the cycle (s)
     offered: int = 0  # coloured detections in the view of the curves
-    explained: int = 0  # those on a curve of their colour
-    used: int = 0
-    innovations: float = 0.0  # sum of squared normalized innovations of those in use
-    closed: bool = False
-    sigma: float = nan  # of the position in its worst direction on a closed map (m)
-    offered_by: tuple[int, int] = (0, 0)  # offered detections, left and right, of a closed map
-    explained_by: tuple[int, int] = (0, 0)  # explained ones
-    unmapped: tuple[int, int] = (0, 0)  # other coloured ones beside a gap of a closed map
-    rests: bool = False  # whether the vehicle stands, and needs no detections
-    odometry: str = ""  # what is wrong with it since the cycle before
+    explained: int = 0  # offered detections on a curve of their colour
+    used: int = 0  # detections in use
+    innovations: float = 0.0  # sum of squared normalized innovations of used detections
+    closed: bool = False  # whether the map is closed
+    sigma: float = nan  # standard deviation of the position in its worst direction, closed map (m)
+    offered_by: tuple[int, int] = (0, 0)  # offered detections by label, closed map
+    explained_by: tuple[int, int] = (0, 0)  # explained detections by label
+    unmapped: tuple[int, int] = (0, 0)  # other coloured detections beside a gap, by label
+    rests: bool = False  # whether the vehicle is at rest and needs no detections
+    odometry: str = ""  # fault of the odometry since the previous cycle
 
 
-class HealthMonitor:
-    """Judge of the newest cycles' evidence together."""
+class HealthMonitor(Copyable):
+    """Health by the evidence of the newest cycles."""
 
     def __init__(self) -> None:
         self._recent: deque[Evidence] = deque()
-        self._offered = 0  # by all the recent cycles together
+        self._offered = 0  # offered detections of the recent cycles
         self._last_offered: float | None = None
-        self._wrong: int | None = None  # this boundary is wrong, as long as it explains too little
-
-    def copy(self) -> Self:
-        """Return a monitor that can go on independently."""
-        other = shallow(self)
-        other._recent = self._recent.copy()
-        return other
+        self._wrong: int | None = None  # wrong boundary, while it explains too few detections
 
     def restart(self) -> None:
         self._recent.clear()
@@ -86,13 +80,13 @@ class HealthMonitor:
             explained, used, squares = explained + one.explained, used + one.used, squares + one.innovations
         share = explained / offered if offered >= MIN_OFFERED else 1.0
         innovation = squares / used if used >= MIN_OFFERED else 0.0
-        cones = max(used / len(self._recent), 1.0)  # cycles show the same ones, with the same errors
+        cones = max(used / len(self._recent), 1.0)  # cycles repeat the errors of the same cones
         most = MAX_INNOVATION * (1.0 + (2.0 / cones) ** 0.5)
         health = self._judge(evidence, share, innovation, most)
         return self._beside_gap(offered) if health == Health(GOOD) else health
 
     def _beside_gap(self, offered: int) -> Health:
-        """Return the health where nothing is wrong, but the map may have a gap of a boundary."""
+        """Return the health of a good estimate, which is degraded beside a gap of a boundary."""
         unmapped = [sum(one.unmapped[label] for one in self._recent) for label in BOUNDARIES]
         most = (1.0 - SHARE_DEGRADED) * (offered + sum(unmapped))
         names = [NAMES[label] for label in BOUNDARIES if unmapped[label] > most]
@@ -101,7 +95,7 @@ class HealthMonitor:
         return Health(DEGRADED, f"the {names[0]} boundary is not mapped here") if names else Health(GOOD)
 
     def _wrong_side(self) -> str:
-        """Return which boundary is wrong, where the other one explains its detections or did so last."""
+        """Name a wrong boundary, if the other one explains its detections, or was the last to do so."""
         holds = [self._holds(label) for label in BOUNDARIES]
         if True in holds:
             self._wrong = 1 - holds.index(True)
@@ -128,7 +122,7 @@ class HealthMonitor:
             self._offered -= recent.popleft().offered
 
     def _judge(self, newest: Evidence, share: float, innovation: float, most: float) -> Health:
-        lost = SHARE_LOST if newest.closed else 0.0  # on an open map it goes on by dead reckoning
+        lost = SHARE_LOST if newest.closed else 0.0  # on an open map dead reckoning suffices
         degraded = SHARE_DEGRADED if newest.closed else OPEN_DEGRADED
         blind = newest.t - (newest.t if self._last_offered is None else self._last_offered)
         if newest.sigma > SIGMA_DEGRADED:
@@ -151,12 +145,12 @@ class HealthMonitor:
 
 @dataclass(frozen=True)
 class HealthStretch:
-    """A run of cycles of one condition that is not good."""
+    """Successive cycles of one condition that is not good."""
 
     health: str
     begin: float  # stamp of its first cycle (s)
     end: float  # stamp of its last cycle (s)
-    reason: str  # of its first cycle
+    reason: str  # reason of its first cycle
 
 
 def stretches(t: Sequence[float], healths: Sequence[Health]) -> list[HealthStretch]:

@@ -1,4 +1,4 @@
-"""Boundary labels: the side of the track that a detection marks; and what detections are of."""
+"""Labels: the boundary that a detection belongs to, and the kind of detections."""
 
 from typing import Final, Literal, get_args
 
@@ -6,9 +6,9 @@ LEFT, RIGHT, UNKNOWN, ORANGE, BIG_ORANGE = range(5)
 NAMES: Final = ("left", "right", "unknown", "orange", "big_orange")  # of the file format, by label
 LABELS: Final = {name: label for label, name in enumerate(NAMES)}
 BOUNDARIES: Final = (LEFT, RIGHT)
-POINTS: Final = (ORANGE, BIG_ORANGE)  # they bound no road: they stand at gates, and along lanes to a track
+POINTS: Final = (ORANGE, BIG_ORANGE)  # of no boundary: at gates, and along lanes to a track
 
-Kind = Literal["cones", "line", "line-left", "line-right"]  # what detections are of, on both sides or on one
+Kind = Literal["cones", "line", "line-left", "line-right"]  # kind of detections, on both sides or on one
 KINDS: Final = get_args(Kind)
 
 _CODES: Final = LABELS | {
@@ -18,5 +18,5 @@ _CODES: Final = LABELS | {
 
 
 def label_from_name(name: str) -> int:
-    """Return the label of a word, of either case and with `-` for `_`; UNKNOWN for any other (FORMATS)."""
+    """Return the label of a word, ignoring case and with `-` as `_`; UNKNOWN for any other word."""
     return _CODES.get(name.strip().lower().replace("-", "_"), UNKNOWN)

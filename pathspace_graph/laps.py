@@ -1,24 +1,24 @@
-"""Laps: they are counted online from poses, in the same way for an estimate and for the truth."""
+"""Online lap counter by poses, for estimate and truth."""
 
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# what counts as passing the start line, the y axis of the map frame at the first pose
-MIN_LAP_PATH: Final = 25.0  # least length of a lap (m along the path); jitter may cross the line sooner
-MIN_LAP_REACH: Final = 7.0  # least distance from the start that a lap leads to (m)
-LINE_HALF_WIDTH: Final = 5.0  # of the start line (m), with room for the racing line and a lap's drift
-LINE_DEPTH: Final = 10.0  # distance past the line (m) at which a crossing is noticed where an estimate jumped
+# the start line is the y axis of the map frame
+MIN_LAP_PATH: Final = 25.0  # least length of a lap (m along the path): jitter may cross the line before
+MIN_LAP_REACH: Final = 7.0  # least distance from the start that a lap must reach (m)
+LINE_HALF_WIDTH: Final = 5.0  # half width of the start line (m), with room for racing line and drift
+LINE_DEPTH: Final = 10.0  # distance past the line at which a jump over it still counts as a crossing (m)
 LINE_HEADING: Final = np.pi / 3  # largest difference of the heading from the start's at the line (rad)
 LAP_END_TOLERANCE: Final = 5.0  # largest distance before the line at which a last lap is complete (m)
 
 
 class LapCounter:
-    """Counter of laps: one ends where the start line is crossed forward after a lap's length of path.
+    """Counter of laps, which end with a forward crossing of the start line after a minimum path.
 
-    Poses are [x, y, theta] in the map frame, whose origin and x axis are the start. An online estimate may
-    jump when a loop closes, so a pose just behind the line that heads forward ends the lap as well.
+    The map frame has its origin and its x axis at the start. An online estimate may jump when a loop closes,
+    so a pose just past the line with a forward heading ends a lap as well.
     """
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class LapCounter:
         self._last: tuple[float, float, float] | None = None
 
     def update(self, pose: ArrayLike) -> int:
-        """Return the lap, counted from 1, that the next `pose` (3,) [x, y, theta] belongs to."""
+        """Return the lap, counted from 1, of the next `pose` (x, y, theta) (3,), map frame."""
         x, y, theta = (float(value) for value in np.asarray(pose, dtype=float))
         if self._last is not None:
             self._path += float(np.hypot(x - self._last[0], y - self._last[1]))
@@ -41,7 +41,7 @@ class LapCounter:
 
     @property
     def last_lap_is_complete(self) -> bool:
-        """Say whether the current lap has come back to within `LAP_END_TOLERANCE` of the start line."""
+        """Whether the current lap has returned to within `LAP_END_TOLERANCE` of the start."""
         if self._last is None or not self._has_driven_a_lap():
             return False
         x, y, theta = self._last
@@ -49,7 +49,7 @@ class LapCounter:
 
     @property
     def completed(self) -> int:
-        """Return the number of complete laps, with a last one that ends just before the line."""
+        """Return the number of complete laps, including one that ends just before the line."""
         return self.lap - 1 + int(self.last_lap_is_complete)
 
     def _has_driven_a_lap(self) -> bool:
@@ -69,7 +69,7 @@ class LapCounter:
 
 
 def lap_end_indices(poses: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Return the index of the pose (k,) at which each complete lap ends, of poses (N, 3), map frame."""
+    """Return the indices (k,) of the poses (N, 3), map frame, at which complete laps end."""
     counter = LapCounter()
     laps = np.array([counter.update(pose) for pose in poses], dtype=int)
     ends = np.flatnonzero(np.diff(laps)) + 1

@@ -1,4 +1,4 @@
-"""Records and texts of a scene of another size, by the power of a length that each of their numbers has."""
+"""Rescaling of records and texts by the power of length of each of their numbers."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -8,12 +8,12 @@ import numpy as np
 
 T = TypeVar("T")
 
-POSE_LENGTHS: Final = (1, 1, 0)  # powers of the length in a pose, or in a twist
+POSE_LENGTHS: Final = (1, 1, 0)  # powers of length in a pose or a twist
 
 
 @dataclass(frozen=True)
 class Length:
-    """A number of a text in m or m/s, or in a power of m: `f"{Length(0.3):.2f} m"`."""
+    """Number in a text with a power of length in its unit, such as m or m/s: `f"{Length(0.3):.2f} m"`."""
 
     value: float
     power: int = 1
@@ -26,13 +26,13 @@ class Length:
 
 
 class Text(str):
-    """A text with lengths, made again of its figures for a scene of another size.
+    """Text with lengths that can be rescaled.
 
     An example is `Text("{place} is {far:.2f} m away", place="the end", far=Length(0.3))`.
     """
 
     template: str
-    figures: dict[str, Any]  # by their names in the template; a Length or a Text changes with the scale
+    figures: dict[str, Any]  # by name in the template; a Length or a Text is rescaled
 
     def __new__(cls, template: str, **figures: Any) -> Self:
         text = super().__new__(cls, template.format(**figures))
@@ -43,22 +43,22 @@ class Text(str):
         return type(self)(self.template, **times(self.figures, 0, factor))
 
     def __getnewargs_ex__(self) -> tuple[tuple[str], dict[str, Any]]:
-        """Return what a copy is made of: it comes back from worker processes."""
+        """Pickle the text for worker processes."""
         return (self.template,), self.figures
 
 
 def joined(texts: Iterable[str], separator: str = "; ") -> str:
-    """Return the texts that are not empty as one, in which lengths still change with the scale."""
+    """Join the texts that are not empty to one that can be rescaled."""
     figures = {f"part{k}": text for k, text in enumerate(filter(None, texts))}
     return Text(separator.join(f"{{{name}}}" for name in figures), **figures)
 
 
 def scaled(one: T, factor: float) -> T:
-    """Return a record of a scene that is `factor` times as large; time does not change.
+    """Rescale the lengths of a record by `factor`; times do not change.
 
-    A dataclass says in `LENGTHS` which of its fields have a length: its power, or one for each last index.
-    A matrix under a name in `COVARIANCES` has one power for each row and column. With the power 0 only
-    records and texts inside are changed.
+    The class attribute `LENGTHS` has the power of length of each field, or one for each last index. For a
+    covariance in `COVARIANCES` there is a power for each row and column. A power of 0 rescales only nested
+    records and texts.
     """
     if factor == 1.0 or not hasattr(type(one), "LENGTHS"):
         return one
@@ -73,7 +73,7 @@ def scaled(one: T, factor: float) -> T:
 
 
 def times(value: Any, power: Any, factor: float) -> Any:
-    """Return a value times a power of a factor, or one power for each last index; it may hold others."""
+    """Multiply a value by a power of a factor, or by one power for each last index; nested values as well."""
     if hasattr(type(value), "LENGTHS"):
         return scaled(value, factor)
     if isinstance(value, Length | Text):

@@ -1,4 +1,4 @@
-"""The interface of estimators, and the loop that feeds a log to an online one cycle by cycle."""
+"""Interfaces of the estimators, and the loop that feeds a log to an online one."""
 
 import gc
 import time
@@ -35,98 +35,99 @@ class CycleResult(Brief):
     t: float
     """Stamp of the cycle (s)."""
     pose: Array
-    """Pose [x, y, theta] (3,) of the vehicle, m and rad, map frame; theta isn't wrapped."""
+    """Pose (x, y, theta) (3,) of the vehicle in m and rad, map frame; theta is not wrapped."""
     sizes: tuple[int, int]
-    """Numbers of control points, or of landmarks, of the left and of the right boundary."""
+    """Numbers of control points or landmarks of the left and the right boundary."""
     readings: int
-    """Number of the cycle's detections that were used."""
+    """Number of detections in use."""
     closed: bool
+    """Whether the loop has closed."""
     stages: Mapping[str, float] = field(default_factory=dict)
-    """Time of each stage of the update (s), by the stage's name."""
+    """Time of each stage of the update (s), by name."""
     jump: Array | None = None
-    """Jump (3,) [m, m, rad] of the newest pose in the map frame, where the map was replaced in this cycle by
-    one that was solved as a batch."""
+    """Jump (3,) of the newest pose in m, m and rad, map frame, if this cycle has replaced map or pose."""
     notice: str = ""
-    """What a user should know of the cycle; empty if there is nothing."""
+    """Message for the user; empty in most cycles."""
     health: Health = field(default_factory=Health)
-    """How far the estimate can be trusted; empty for an estimator without a monitor."""
+    """Health of the estimate; empty for an estimator without a monitor."""
     dropped: int = 0
-    """Number of the cycle's detections that were dropped as impossible."""
+    """Number of detections dropped as impossible."""
     refused: int = 0
-    """Number of cycles that were refused since the last one that was used."""
+    """Number of cycles refused since the last admitted one."""
 
 
 @runtime_checkable
 class OnlineEstimator(Protocol):
-    """Interface of every online estimator; `docs/estimators.md` lists methods that it may have as well."""
+    """Interface of an online estimator; `docs/estimators.md` lists optional methods."""
 
     @property
     def settings(self) -> Any:
         """Return a frozen dataclass with all settings of the estimator."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        """Process one perception cycle: the twists since the last one, and the detections of this one."""
+        """Process one perception cycle: the twists since the previous one, and its detections."""
 
     def map(self) -> Map:
-        """Return a copy of the map as it stands."""
+        """Return a copy of the present map."""
 
 
 class BatchEstimator(Protocol):
-    """Interface of every batch estimator."""
+    """Interface of a batch estimator."""
 
     @property
     def settings(self) -> Any:
         """Return a frozen dataclass with all settings of the estimator."""
 
     def solve(self, log: Log) -> BatchRun:
-        """Return the optimum over a whole log, whose truth is not read."""
+        """Return the optimum over a whole log; its truth is not used."""
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Detections of the newest cycle as the estimator took them, seen from its newest pose."""
+    """Detections of the newest cycle with their use, placed by the newest pose."""
 
     LENGTHS: ClassVar = {"points": 1, "feet": 1}
 
     points: Array
-    """Detected positions (k, 2) in m, map frame, corrected as the estimator corrects them."""
+    """Detected positions (k, 2) in m, map frame, corrected by the calibration."""
     labels: IntArray
-    """Boundary (k,) of each detection, LEFT, RIGHT or UNKNOWN."""
+    """Boundary (k,) of each detection: LEFT, RIGHT or UNKNOWN."""
     used: BoolArray
-    """Whether each detection (k,) was used; otherwise it was gated."""
+    """Whether each detection (k,) is in use; the others were gated."""
     feet: Array
-    """Foot point (k, 2) of each used detection on its curve or landmark, in m, map frame; NaN for others."""
+    """Foot point (k, 2) of each used detection on its curve or landmark, in m, map frame; otherwise NaN."""
 
 
 def scale(estimator: OnlineEstimator) -> float:
-    """Return the scale of the scene as an estimator knows it; 1 where it takes every scene as it is."""
+    """Return the scale of the scene of an estimator; 1 for one without a scale."""
     return float(getattr(estimator, "scale", 1.0))
 
 
 def _ask(estimator: OnlineEstimator, method: str, *arguments: Any) -> Any:
-    """Return the answer of a method that an estimator may have, or None where it has none."""
+    """Call an optional method of an estimator; None if it has none."""
     return getattr(estimator, method, lambda *_: None)(*arguments)
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedCycle:
-    """A cycle that is over, as an observer sees it: its input, its result, and the estimator as it stands.
+    """A finished cycle for observers: its input, its result, and the estimator.
 
-    Map, readings and window are taken when first asked for, once for all observers, and must not be changed.
+    Map, readings and window are computed at the first access, once for all observers, and must not be
+    changed.
     """
 
     estimator: OnlineEstimator
     detections: Detections
-    """Detections of the cycle, as they were handed over."""
+    """Detections of the cycle, as given to the estimator."""
     result: CycleResult
     number: int = 0
     """Number of the cycle, from 0."""
     seconds: float = nan
-    """Wall time of the whole update (s), where it was measured."""
+    """Wall time of the whole update (s), if measured."""
     lap: int = 1
     """Lap of the estimated trajectory, counted from 1."""
     processor: float = nan
-    """Processor time of this thread in the update (s), which other work on the machine hardly changes."""
+    """CPU time of this thread in the update (s); other processes hardly affect it."""
 
     @cached_property
     def record(self) -> CycleRecord:
@@ -149,36 +150,36 @@ class ObservedCycle:
 
     @cached_property
     def outline(self) -> Map:
-        """Return the map as it stands, without covariances where the estimator can give it so."""
+        """Return the present map, without covariances if the estimator has an `outline`."""
         track: Map | None = _ask(self.estimator, "outline")
         return self.estimator.map() if track is None else track
 
     @cached_property
     def map(self) -> Map:
-        """Return the map as it stands, with its covariances, which takes much longer than the outline."""
+        """Return the present map with covariances, which takes much longer than `outline`."""
         estimator = self.estimator
         with estimator.looked_at() if hasattr(estimator, "looked_at") else nullcontext():
             return estimator.map()
 
     @cached_property
     def readings(self) -> Readings | None:
-        """Return which detections were used; None where the estimator does not say it."""
+        """Return the detections with their use; None if the estimator has no `readings`."""
         readings: Readings | None = _ask(self.estimator, "readings")
         return readings
 
     @cached_property
     def window(self) -> Array:
-        """Return the poses (P, 3) in the window, the oldest first; a filter has none."""
+        """Return the poses (P, 3) in the window, oldest first; a filter has none."""
         poses: Array | None = _ask(self.estimator, "window_poses")
         return np.zeros((0, 3)) if poses is None else poses
 
 
 Observer = Callable[[ObservedCycle], None]
-"""Function that is called after each cycle, whose time is not the estimator's."""
+"""Function that is called after each cycle; its time is not counted as the estimator's."""
 
 
 class Stopwatch:
-    """Times of the stages of an update, from the moment that it is made."""
+    """Stopwatch of the stages of an update; it starts at construction."""
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}
@@ -196,9 +197,10 @@ class Stopwatch:
 
 
 def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
-    """Yield each perception cycle with the twists since the cycle before it, none later than its stamp.
+    """Yield each perception cycle with the twists since the previous cycle, up to its stamp.
 
-    The first row begins at the cycle before with the twist held then; the last is held until this one.
+    The first row starts at the previous cycle with the twist in force there; the last one is held to this
+    cycle.
     """
     since = float(log.odometry.t[0])
     for detections in log.cycles:
@@ -207,7 +209,7 @@ def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
 
 
 def timed_wait(estimator: OnlineEstimator) -> float:
-    """Wait for what the next update may take from another process; return the wall time (s) of that."""
+    """Wait for a batch whose result the next update may use; return the wall time (s)."""
     begin = time.perf_counter()
     _ask(estimator, "wait")
     return time.perf_counter() - begin
@@ -223,8 +225,8 @@ def timed_update(
 
 @contextmanager
 def spared_by_collector() -> Iterator[None]:
-    """Keep what exists already out of garbage collections, of which a full one would take a cycle 0.1 s."""
-    begins = gc.get_freeze_count() == 0  # else a caller has done it, and goes on with it
+    """Exclude existing objects from garbage collection: a full one would delay a cycle by 0.1 s."""
+    begins = gc.get_freeze_count() == 0  # otherwise a caller has frozen them
     if begins:
         gc.freeze()
     try:
@@ -242,11 +244,11 @@ def run_online(
     snapshot_times: Sequence[float] | Array = (),
     observers: Sequence[Observer] = (),
 ) -> RunResult:
-    """Feed a log's odometry and cycles to an online estimator, in order of time and never ahead of it.
+    """Feed a log to an online estimator, cycle by cycle, never reading ahead.
 
-    Maps are kept as they stood at the `snapshot_times` (s, ascending). The `observers` are shown each cycle,
-    outside of its time. BLAS has one thread, results of another process are waited for between cycles, and
-    Python's collector leaves alone what there was before the run.
+    The result has copies of the map at the `snapshot_times` (s, ascending). `observers` are called after each
+    cycle, and their time is not counted. BLAS runs on one thread. Between cycles the run waits for batches,
+    and garbage collection excludes objects older than the run.
     """
     check_type("log", log, Log)
     check_type("estimator", estimator, OnlineEstimator)
@@ -324,5 +326,5 @@ class _Run:
 
 
 def settings_dict(settings: Any) -> dict[str, Any]:
-    """Return a settings dataclass with all nested ones as dictionaries, empty for anything else."""
+    """Convert a dataclass of settings to nested dictionaries; empty for anything else."""
     return asdict(settings) if is_dataclass(settings) and not isinstance(settings, type) else {}

@@ -1,8 +1,8 @@
-"""Scenes of any size: inside of an estimator, every scene has the size of a Formula Student track.
+"""Scale of a scene: inside an estimator, every scene has the size of a Formula Student track.
 
-An estimator is made for one scale. Lengths are divided by it on the way in (`front_end.gate`, `solved`) and
-those of results multiplied by it on the way out. Where the settings leave it open, it is found beforehand,
-from the width of the road and the gaps of its rows in the first metres of the log.
+An estimator has one scale. Its input is divided by it (`front_end.gate`, `solved`), and its results are
+multiplied by it. If the settings have no scale, it is determined beforehand from the width of the road and
+the gaps of its rows in the first metres of the log.
 """
 
 from collections.abc import Callable
@@ -23,29 +23,29 @@ from .run import split_odometry
 
 R = TypeVar("R")
 
-SCENE_WIDTH: Final = 3.5  # m from a cone to the nearest one of the other side in Formula Student, median
-SCENE_GAP: Final = 3.2  # distance of a cone from the nearest one of its row there, m, median
-SCALES: Final = (0.1, 0.3, 1.0, 3.0, 10.0)  # within a factor of 1.7 of one, maps are as good
-SCENE_NEAREST: Final = 5  # number of the nearest cones of each side that tell the scale
-SCENE_FEWEST: Final = 3  # number of cones of each side that a cycle needs
+SCENE_WIDTH: Final = 3.5  # median distance from a cone to the other side in Formula Student (m)
+SCENE_GAP: Final = 3.2  # median distance from a cone to the nearest one of its row there (m)
+SCALES: Final = (0.1, 0.3, 1.0, 3.0, 10.0)  # maps are equally good within a factor of 1.7
+SCENE_NEAREST: Final = 5  # number of nearest cones of each side in use
+SCENE_FEWEST: Final = 3  # least number of cones of each side in a cycle
 SCENE_SAME: Final = 3.0  # largest distance (sigmas) of two detections of one cone
 SCENE_FARTHEST: Final = 1e4  # largest distance of a cone (m), in a scene of any scale
-SCENE_MOVED: Final = 0.1  # share of a gap by which the vehicle moves until the next cycle counts
-SCENE_ENOUGH: Final = 20  # number of cycles that count after which the scale is final
+SCENE_MOVED: Final = 0.1  # least motion between used cycles, as a share of the gap
+SCENE_ENOUGH: Final = 20  # number of used cycles after which the scale is final
 SCENE_PATIENCE: Final = 200  # number of cycles after which it is final in any case
 
 
 class SceneScale:
-    """Finder of a scene's scale, cycle by cycle, where both sides of the road and a row are seen.
+    """Online estimate of a scene's scale from cycles with both sides of the road in view.
 
-    It is the less extreme one of what width and gaps say, and 1 where they disagree, since a wide road isn't
-    a large scene, or where they are out of the range of `SCALES`.
+    The scale is the less extreme one by width and by gaps. It is 1 if they disagree, since a wide road is not
+    a large scene, and outside the range of `SCALES`.
     """
 
     def __init__(self) -> None:
         self._widths: list[float] = []
         self._gaps: list[float] = []
-        self._driven = np.inf  # since the last cycle that counted
+        self._driven = np.inf  # path since the last used cycle (m)
         self._cycles = 0
 
     def see(self, odometry: Odometry, detections: Detections) -> None:
@@ -62,17 +62,17 @@ class SceneScale:
 
     @property
     def value(self) -> float:
-        """Return the scale as far as it is known."""
+        """Return the present estimate of the scale."""
         return _nearest(self._widths, self._gaps) if self._gaps else 1.0
 
     @property
     def is_final(self) -> bool:
-        """Return whether the value changes no more."""
+        """Whether the value is final."""
         return len(self._gaps) >= SCENE_ENOUGH or self._cycles >= SCENE_PATIENCE
 
 
 def scale_of(log: Log) -> float:
-    """Return the scale of a log's scene, which the first metres of its drive tell."""
+    """Return the scale of a log's scene, by the first metres of its drive."""
     scene = SceneScale()
     for cycle in split_odometry(log):
         scene.see(*cycle)
@@ -82,15 +82,15 @@ def scale_of(log: Log) -> float:
 
 
 def chosen_scale(settings: MapperSettings, log: Log) -> float:
-    """Return the scale of the settings, or that of a log's scene where they leave it open."""
+    """Return the scale of the settings or, if they have none, of the log's scene."""
     check_type("log", log, Log)
     return scale_of(log) if settings.scale is None else settings.scale
 
 
 def solved(solve: Callable[[Log, float], R], log: Log, settings: MapperSettings) -> R:
-    """Return the result of a batch in metres of the log; `solve` takes the log at scale 1, and its scale.
+    """Solve a batch at scale 1 and rescale its result; `solve` gets the log at scale 1, and the scale.
 
-    BLAS has one thread, and whatever numerics raise is a SolveError.
+    BLAS runs on one thread, and a numerical failure raises a SolveError.
     """
     scale = chosen_scale(settings, log)
     with threadpool_limits(limits=1), solving("the batch"):
@@ -98,7 +98,7 @@ def solved(solve: Callable[[Log, float], R], log: Log, settings: MapperSettings)
 
 
 def width_and_gap(detections: Detections) -> tuple[float, float]:
-    """Return the width of the road and the gap of its rows (m) in a cycle; NaN where they aren't seen."""
+    """Return the width of the road and the gap of its rows (m) in a cycle; NaN if they are not in view."""
     usable = (np.abs(detections.points_vehicle) < SCENE_FARTHEST).all(axis=1)  # the gate drops the others
     near = detections.where(np.asarray(usable))
     points, covariances, sides = near.points_vehicle, near.covariances, side_of(near)
@@ -113,7 +113,7 @@ def width_and_gap(detections: Detections) -> tuple[float, float]:
 
 
 def side_of(detections: Detections) -> IntArray:
-    """Return the boundary (m,) of each detection: its label, or the side of the vehicle if none has any."""
+    """Return the boundary (m,) of each detection: its label or, if no one has a label, the vehicle's side."""
     labels = detections.labels
     if (labels != UNKNOWN).any():
         return labels
@@ -121,7 +121,7 @@ def side_of(detections: Detections) -> IntArray:
 
 
 def nearest_cones(points: Array, covariances: Array, most: int) -> list[int]:
-    """Return the nearest detections of cones, each cone once, by index, the nearest first."""
+    """Return the indices of the nearest detections, one per cone, nearest first."""
     chosen: list[int] = []
     for k in np.argsort(np.hypot(*points.T)).tolist():
         apart = ((points[chosen] - points[k]) ** 2).sum(axis=1)

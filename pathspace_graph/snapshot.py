@@ -1,8 +1,8 @@
-"""Snapshots: a whole estimator as one file, from which it goes on to the same map.
+"""Snapshots: an estimator in one file, from which it continues to the same map.
 
-A file is a line with its format, a line with the SHA-256 of the rest, and a pickle of the estimator. It is
-verified before it is read, and no code comes from it: it can call only `new`, which makes an object of one
-of our own classes without its constructor, and `MAKERS`. The version of the package that wrote it reads it.
+A file has a line with its format, a line with the SHA-256 of the rest, and a pickle of the estimator. It is
+verified before it is read. It contains no code: it can call only `new`, which creates an object of one of our
+own classes without its constructor, and `MAKERS`. Only the version of the package that wrote it can read it.
 """
 
 import io
@@ -37,7 +37,7 @@ from .errors import InputError, PathspaceError, SettingsError
 E = TypeVar("E")
 
 SNAPSHOT: Final = f"pathspace-snapshot/3 of pathspace-graph {version('pathspace-graph')}"
-ROOMS: Final = tuple(  # rooms and modules whose classes estimators are made of
+ROOMS: Final = tuple(  # rooms and modules with classes of estimators
     f"{__package__}.{room}"
     for room in (
         *("baselines", "batch", "factors", "front_end", "graph", "health", "io.log", "lengths", "loop"),
@@ -54,15 +54,15 @@ OPERATIONS: Final = frozenset(
         *("EMPTY_DICT", "SETITEM", "SETITEMS", "EMPTY_SET", "ADDITEMS", "FROZENSET"),
     )
 )
-"""Operations of pickles that `save` writes."""
-FORMAT_ERRORS: Final = (  # of a file that does not fit together; they include Recursion- and UnicodeError
+"""Pickle operations that `save` writes."""
+FORMAT_ERRORS: Final = (  # errors of an inconsistent file, including Recursion- and UnicodeError
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, MemoryError),
     *(OSError, EOFError, ImportError, pickle.UnpicklingError),
 )
 
 
 def save(estimator: object, path: Path | str) -> None:
-    """Write an estimator to one file; SettingsError where it holds something that cannot be saved."""
+    """Write an estimator to one file; SettingsError if a part of it cannot be saved."""
     stream = io.BytesIO()
     _Pickler(stream, pickle.HIGHEST_PROTOCOL).dump(estimator)
     content = stream.getvalue()
@@ -71,7 +71,7 @@ def save(estimator: object, path: Path | str) -> None:
 
 
 def restore(path: Path | str, kind: type[E], check: Callable[[E], object]) -> E:
-    """Return the estimator of a file; InputError where there is none, or `check` of a copy raises."""
+    """Read an estimator from a file; InputError if there is none, or `check` raises for a copy."""
     file = Path(path)
     content = _verified(file)
     try:
@@ -87,9 +87,9 @@ def restore(path: Path | str, kind: type[E], check: Callable[[E], object]) -> E:
 
 
 def _check_operations(content: bytes) -> None:
-    """Raise an UnpicklingError where a pickle has an operation that `save` does not write.
+    """Raise an UnpicklingError for an operation that `save` does not write.
 
-    Others reserve memory by a number in the file, or warn of a text.
+    Others may allocate memory by a number in the file, or emit warnings.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -99,7 +99,7 @@ def _check_operations(content: bytes) -> None:
 
 
 def _verified(file: Path) -> bytes:
-    """Return the pickle of a file; InputError where it is of another format, or not as it was written."""
+    """Return the pickle of a file; InputError for another format or a wrong checksum."""
     head, _, rest = read_bytes(file, "a snapshot").partition(b"\n")
     if head != SNAPSHOT.encode():
         raise InputError(file, f"expected {SNAPSHOT}, found {shown(head[:80].decode(errors='replace'))}")
@@ -109,11 +109,11 @@ def _verified(file: Path) -> bytes:
     return content
 
 
-# --- what is taken apart, and of what it is made again ---------------------------------------------------
+# --- functions that restore objects from their parts -----------------------------------------------------
 
 
 def array_of(content: bytes, dtype: str, shape: tuple[int, ...], order: Any, writeable: bool) -> NDArray[Any]:
-    """Return an array of one of our types; its memory is laid out as it was, if it was contiguous."""
+    """Restore an array of one of `DTYPES`, with its memory order if it was contiguous."""
     if dtype not in DTYPES:
         raise ValueError(f"expected one of the types {', '.join(DTYPES)}, found {shown(dtype)}")
     array = np.frombuffer(content, dtype).copy().reshape(shape, order=order)
@@ -129,12 +129,12 @@ def _array_parts(array: NDArray[Any]) -> tuple[Any, ...]:
 
 
 def number_of(array: NDArray[Any]) -> Any:
-    """Return the number of NumPy's of an array without axes."""
+    """Restore a NumPy scalar from an array without axes."""
     return array[()]
 
 
 def new(module: str, name: str) -> object:
-    """Return an object of one of our classes, without its constructor."""
+    """Create an object of one of our classes without its constructor."""
     found = getattr(sys.modules.get(module), name, None) if _is_own(module) else None
     if not isinstance(found, type) or found.__module__ != module:
         raise ValueError(f"expected a class of an estimator, found {shown(f'{module}.{name}')}")
@@ -142,21 +142,21 @@ def new(module: str, name: str) -> object:
 
 
 def tree_of(points: NDArray[np.float64]) -> KDTree:
-    """Return the tree of points (n, d)."""
+    """Restore the tree of points (n, d)."""
     return KDTree(points)
 
 
 def nothing() -> None:
-    """Return None: what a process is about to give is asked for again."""
+    """Restore a future as None: its work is submitted again."""
 
 
 def store_of(*groups: tuple[Any, Any, Any, Any]) -> RowStore:
-    """Return the store of groups of rows, each by keys, derivatives, residuals and owners."""
+    """Restore a store from groups of rows: keys, derivatives, residuals and owners."""
     return RowStore([Rows(*parts) for parts in groups])
 
 
 def bayes_net_of(*conditionals: gtsam.GaussianConditional) -> gtsam.GaussianBayesNet:
-    """Return a net of conditionals, in this order."""
+    """Restore a net of conditionals, in this order."""
     net = gtsam.GaussianBayesNet()
     for conditional in conditionals:
         net.push_back(conditional)
@@ -164,17 +164,17 @@ def bayes_net_of(*conditionals: gtsam.GaussianConditional) -> gtsam.GaussianBaye
 
 
 def conditional_of(keys: Any, matrix: Any, frontals: int) -> gtsam.GaussianConditional:
-    """Return the conditional of the first `frontals` keys (k,), with `[A b]` as its matrix."""
+    """Restore a conditional of the first `frontals` keys (k,) with the matrix `[A b]`."""
     return linear.conditional_of(keys, sizes(keys), frontals, matrix)
 
 
 def jacobian_of(keys: Any, matrix: Any) -> gtsam.JacobianFactor:
-    """Return the factor of keys (k,) with `[A b]` as its matrix."""
+    """Restore a factor of keys (k,) with the matrix `[A b]`."""
     return linear.jacobian_factor_of(keys, sizes(keys), matrix)
 
 
 def hessian_of(keys: Any, matrix: Any) -> gtsam.HessianFactor:
-    """Return the factor of keys (k,) with its augmented information as matrix."""
+    """Restore a factor of keys (k,) with its augmented information matrix."""
     return linear.hessian_factor_of(keys, sizes(keys), matrix)
 
 
@@ -191,7 +191,7 @@ def _hessian_parts(factor: gtsam.HessianFactor) -> tuple[Any, ...]:
     return linear.keys_of_factor(factor), linear.hessian_matrix(factor)
 
 
-# how an instance of another package's type is made again, and of which parts
+# for types of other packages: the function that restores an instance, and its parts
 MAKERS: Final[dict[type, tuple[Callable[..., Any], Callable[[Any], Iterable[Any]]]]] = {
     np.ndarray: (array_of, _array_parts),
     slice: (slice, lambda span: (span.start, span.stop, span.step)),
@@ -214,7 +214,7 @@ def _is_own(module: str) -> bool:
 
 class _Pickler(pickle.Pickler):
     def reducer_override(self, one: Any) -> Any:
-        """Return how an object is made again; a cached property is left out."""
+        """Return a call that restores an object; cached properties are left out."""
         kind = type(one)
         if kind in MAKERS:
             make, parts = MAKERS[kind]
@@ -237,7 +237,7 @@ class _Pickler(pickle.Pickler):
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        """Return one of the functions that make objects; no class and nothing else is found."""
+        """Return one of the functions that restore objects, and nothing else."""
         for call in _CALLED:
             if (module, name) == (call.__module__, call.__qualname__):
                 return call

@@ -1,15 +1,12 @@
 from pathspace_graph.health import DEGRADED, Health
-from pathspace_graph.loop.drive import Step
+from pathspace_graph.loop.drive import Phase, Step
 
 
-class PitLane:
+class PitLane(Phase):
     uses_detections = False  # the pose is predicted by odometry alone, and nothing changes the map
 
     def __init__(self, circuit):
         self.circuit = circuit  # phase to return to
-
-    def copy(self):
-        return PitLane(self.circuit.copy())
 
     def judge(self, road, drive, classified, reading):
         return self, Health(DEGRADED, "the vehicle is in the pit lane")
@@ -17,6 +14,3 @@ class PitLane:
     def step(self, road, drive, reading, spent):
         drive.record.estimated(road)
         return Step(self if self.circuit.is_in_lane(road) else self.circuit)
-
-    def take(self, road, drive, outcome):
-        return Step(self)

@@ -2,6 +2,8 @@
 
 #include "rows.hpp"
 
+#include <map>
+
 namespace kernels {
 namespace {
 
@@ -114,48 +116,63 @@ py::tuple summed(const py::handle& own_layout, const py::list& factors, const py
   return py::make_tuple(hessian, gradient);
 }
 
-// The rows `[A b]` of groups on the variables that they hold, and the places of these variables.
-py::tuple block_on(const Layout& layout, const std::vector<Group>& all) {
-  Index height = 0, width = 0;
+struct RowIn {
+  const Group* group;
+  Index row;
+  const Index* keys() const { return group->rows.keys.data() + row * group->rows.keys.shape(1); }
+};
+
+// Rows `[J -r]` on the variables that they hold, and the places of these variables.
+py::tuple block_on(const Layout& layout, const std::vector<RowIn>& rows) {
+  Index width = 0;
   std::vector<Index> first(layout.size(), -1), held;
-  for (const Group& group : all) {
-    const Rows& rows = group.rows;
-    height += rows.size();
-    const Index k = rows.keys.shape(1);
-    const Index* own = rows.keys.data();
-    for (Index i = 0; i < rows.keys.size(); ++i)  // neighbouring rows mostly hold the same variables
-      if (i < k || own[i] != own[i - k]) first[layout.place(own[i])] = 0;
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    const Index k = rows[i].group->rows.keys.shape(1);
+    const bool follows = i > 0 && rows[i].group == rows[i - 1].group;
+    for (Index c = 0; c < k; ++c)  // neighbouring rows mostly hold the same variables
+      if (!follows || rows[i].keys()[c] != rows[i - 1].keys()[c]) first[layout.place(rows[i].keys()[c])] = 0;
   }
   for (Index k = 0; k < layout.size(); ++k)
     if (first[k] == 0) held.push_back(k), first[k] = width, width += layout.widths.data()[k];
+  const Index height = static_cast<Index>(rows.size());
   Columns block(Shape{height, width + 1});
   double* at = block.mutable_data();
   std::fill_n(at, height * (width + 1), 0.0);
-  for (std::size_t g = 0; g < all.size(); ++g) {
-    const Rows& rows = all[g].rows;
-    const Pattern& pattern = all[g].pattern;
-    const Index k = rows.keys.shape(1);
-    std::vector<Index> begin(k);
-    for (Index i = 0; i < rows.size(); ++i, ++at) {
-      const Index* own = rows.keys.data() + i * k;
-      for (Index c = 0; c < k; ++c)
-        if (i == 0 || own[c] != own[c - k]) begin[c] = first[layout.place(own[c])];
-      for (Index j = 0; j < rows.width(); ++j)
-        at[(begin[pattern.key[j]] + pattern.entry[j]) * height] = rows.jacobian.data()[i * rows.width() + j];
-      at[width * height] = -rows.residual.data()[i];
-    }
+  std::vector<Index> begin;
+  for (Index i = 0; i < height; ++i, ++at) {
+    const Rows& own = rows[i].group->rows;
+    const Pattern& pattern = rows[i].group->pattern;
+    const bool follows = i > 0 && rows[i].group == rows[i - 1].group;
+    begin.resize(own.keys.shape(1));
+    for (std::size_t c = 0; c < begin.size(); ++c)
+      if (!follows || rows[i].keys()[c] != rows[i - 1].keys()[c])
+        begin[c] = first[layout.place(rows[i].keys()[c])];
+    const double* jacobian = own.jacobian.data() + rows[i].row * own.width();
+    for (Index j = 0; j < own.width(); ++j)
+      at[(begin[pattern.key[j]] + pattern.entry[j]) * height] = jacobian[j];
+    at[width * height] = -own.residual.data()[rows[i].row];
   }
   return py::make_tuple(Ints(Shape{static_cast<Index>(held.size())}, held.data()), block);
 }
 
-py::tuple block_of(const py::handle& own_layout, const py::sequence& groups) {
+py::list blocks_of(const py::handle& own_layout, const py::sequence& groups) {
+  const Layout layout(own_layout);
   std::vector<Group> all;
   for (const py::handle& own : groups) {
     const Rows rows(own);
-    all.push_back({rows, rows.size() ? Pattern(own) : Pattern()});
-    expect(rows.size() == 0 || Index(all.back().pattern.key.size()) == rows.width());
+    if (rows.size() == 0) continue;
+    all.push_back({rows, Pattern(own)});
+    expect(Index(all.back().pattern.key.size()) == rows.width());
   }
-  return block_on(Layout(own_layout), all);
+  std::map<Index, std::vector<RowIn>> owned;
+  for (const Group& group : all)
+    for (Index i = 0; i < group.rows.size(); ++i) owned[group.rows.owner.data()[i]].push_back({&group, i});
+  py::list blocks;
+  for (const auto& [owner, rows] : owned) {
+    const py::tuple block = block_on(layout, rows);
+    blocks.append(py::make_tuple(owner, block[0], block[1]));
+  }
+  return blocks;
 }
 
 Ints columns_of(const py::handle& own_layout, const py::handle& own) {
@@ -206,13 +223,11 @@ bool holds(const Rows& rows, Index row, const Ints& ascending) {
 
 Ints as_array(const std::vector<Index>& values) { return Ints(Shape{Index(values.size())}, values.data()); }
 
-// The rows that stay, and those that leave, in their order.
-std::pair<Rows, Rows> parted(const Rows& all, const std::vector<bool>& goes) {
-  const Index count = std::count(goes.begin(), goes.end(), true), k = all.keys.shape(1);
-  Rows stay(all.size() - count, k, all.width()), leave(count, k, all.width());
+Rows staying(const Rows& all, const std::vector<bool>& goes) {
+  Rows stay(std::count(goes.begin(), goes.end(), false), all.keys.shape(1), all.width());
   for (Index i = 0, kept = 0; i < all.size(); ++i)
-    goes[i] ? leave.set(i - kept, all, i) : stay.set(kept++, all, i);
-  return {stay, leave};
+    if (!goes[i]) stay.set(kept++, all, i);
+  return stay;
 }
 
 }  // namespace
@@ -322,28 +337,25 @@ void RowStore::replace(const Ints& owners, const py::sequence& fresh, const py::
 void RowStore::drop(const Ints& owners) {
   std::vector<Group> groups;
   for (const Group& group : groups_) {
-    const Rows stay = parted(group.rows, owned_by(group.rows, owners)).first;
+    const Rows stay = staying(group.rows, owned_by(group.rows, owners));
     if (stay.size()) groups.push_back({stay, group.pattern});
   }
   groups_ = groups;
 }
 
 py::tuple RowStore::pop(Index owner, const py::handle& layout) {
-  const Ints owners(Shape{1}, &owner);
-  std::vector<Group> groups, popped;
-  for (const Group& group : groups_) {
-    const auto [stay, leave] = parted(group.rows, owned_by(group.rows, owners));
-    if (stay.size()) groups.push_back({stay, group.pattern});
-    if (leave.size()) popped.push_back({leave, group.pattern});
-  }
+  std::vector<RowIn> popped;
+  for (const Group& group : groups_)
+    for (Index i = 0; i < group.rows.size(); ++i)
+      if (group.rows.owner.data()[i] == owner) popped.push_back({&group, i});
   const py::tuple block = block_on(Layout(layout), popped);
-  groups_ = groups;
+  drop(Ints(Shape{1}, &owner));
   return block;
 }
 
 void add_rows(py::module_& module) {
   module.def("summed", &summed);
-  module.def("block_of", &block_of);
+  module.def("blocks_of", &blocks_of);
   module.def("moved_residual", &moved_residual);
   module.def("columns_of", &columns_of);
   py::class_<RowStore>(module, "RowStore")

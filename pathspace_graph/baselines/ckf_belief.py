@@ -1,6 +1,6 @@
-"""The state of the paper's filters: a joint Gaussian over pose and map, moved by the cubature rule.
+"""State of the paper's filters: a joint Gaussian over pose and map, propagated by the cubature rule.
 
-The third-degree spherical-radial rule (Arasaratnam and Haykin 2009) is the paper's transform.
+The paper's transform is the third-degree spherical-radial rule (Arasaratnam and Haykin 2009).
 """
 
 from collections.abc import Callable
@@ -21,22 +21,22 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
 
 _LEAST_VARIANCE: Final = 1e-12
-"""Share of the largest eigenvalue to which others are raised where a covariance has no Cholesky factor."""
+"""Least eigenvalue of a covariance without a Cholesky factor, relative to the largest one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Transformed:
-    """The moments of a function of a Gaussian, by the cubature rule."""
+    """Moments of a function of a Gaussian, by the cubature rule."""
 
     mean: Array  # (q,) mean of the function
     covariance: Array  # (q, q) covariance of the function
     slope: Array
-    """(q, d) Statistical linearization `C_yx C_xx^-1`. The covariance of the function with a
-    variable z that it does not depend on is `slope @ C_xz`, which is exact for Gaussians."""
+    """(q, d) Statistical linearization `C_yx C_xx^-1`. The covariance of the function with a variable z that
+    it does not depend on is `slope @ C_xz`, exactly for Gaussians."""
 
 
 def square_root(covariance: Array) -> Array:
-    """Return the lower L with `L L' = covariance` (d, d). Small eigenvalues are raised if it is singular."""
+    """Lower L with `L L' = covariance` (d, d); small eigenvalues of a singular covariance are raised."""
     factor, info = lapack.dpotrf(covariance, lower=1, clean=1)
     if info == 0:
         return np.asarray(factor)
@@ -46,15 +46,15 @@ def square_root(covariance: Array) -> Array:
 
 
 def cubature_points(mean: Array, root: Array) -> Array:
-    """Return `mean +- sqrt(d) L e_i` (2 d, d), the positive ones first; each has the weight 1 / (2 d)."""
+    """Cubature points `mean +- sqrt(d) L e_i` (2 d, d), the positive ones first, of weight 1 / (2 d) each."""
     offsets = np.sqrt(len(mean)) * root.T
     return np.concatenate([mean + offsets, mean - offsets])
 
 
 def transform(function: Callable[[Array], Array], mean: Array, covariance: Array) -> Transformed:
-    """Return mean, covariance and slope of `function`, which maps points (k, d) row by row to (k, q).
+    """Compute mean, covariance and slope of `function`, which maps points (k, d) row by row to (k, q).
 
-    All are exact for a linear function, and the mean is exact for a polynomial of the third degree.
+    All are exact for a linear function; the mean is exact for a polynomial of the third degree.
     """
     root = square_root(covariance)
     d = len(mean)
@@ -76,8 +76,8 @@ class Belief:
 
     Pose (x, y, theta) and points (x, y) are in the map frame, in m and rad. The calibration is the scale
     error of the speeds, the bias of the yaw rate (rad/s), and `factors.sensor:SENSOR`. Only the entries of x
-    that a model depends on get cubature points. The others follow by the joint covariance, as by the full
-    rule but without its cubic cost.
+    that a model depends on get cubature points. The others follow by the joint covariance. The result is that
+    of the full rule, without its cubic cost.
     """
 
     def __init__(self, pose: Array, covariance: Array, calibration_sigma: Array | None = None) -> None:
@@ -89,9 +89,9 @@ class Belief:
 
     @classmethod
     def at_start(cls, settings: OdometrySettings, sensor: CalibrationSettings) -> Self:
-        """Return the belief at the first odometry stamp, with an empty map.
+        """Make the belief at the first odometry stamp, with an empty map.
 
-        The priors of the sensor are wide: unlike a window, a filter cannot explain past errors anew.
+        The priors of the sensor are wide: unlike a window, a filter cannot relinearize past errors.
         """
         calibration = np.array([*settings.sigmas, *sensor.widened().sigmas])
         belief = cls(np.zeros(POSE), np.diag(np.square(settings.sigmas_start)), calibration)
@@ -101,27 +101,27 @@ class Belief:
 
     @property
     def pose(self) -> Array:
-        """Mean pose (3,), a view of the mean; theta is not wrapped."""
+        """View of the mean pose (3,); theta is not wrapped."""
         return self.mean[:POSE]
 
     @property
     def points(self) -> Array:
-        """Return a view of the mean points (m, 2)."""
+        """View of the mean points (m, 2)."""
         return self.mean[HEAD:].reshape(-1, POINT)
 
     @property
     def sensor(self) -> Array:
-        """Return a view of the mean calibration of the sensor (5,)."""
+        """View of the mean calibration of the sensor (5,)."""
         return self.mean[POSE + CALIBRATION_SIZE : HEAD]
 
     def corrected(self, detections: Detections) -> Detections:
-        """Return the newest detections, corrected by the mean calibration of the sensor."""
+        """Correct the newest detections by the mean calibration of the sensor."""
         points = detections.points_vehicle
         twists = np.tile(self.twist, (len(points), 1))
         return replace(detections, points_vehicle=corrected(points, twists, self.sensor))
 
     def by_sensor(self, points_vehicle: Array) -> Array:
-        """Return the derivatives (m, 2, 5) of the newest detections (m, 2) by the sensor's calibration."""
+        """Derivatives (m, 2, 5) of the newest detections (m, 2) by the sensor's calibration."""
         return by_sensor(points_vehicle, np.tile(self.twist, (len(points_vehicle), 1)))
 
     def vehicle_state(self) -> VehicleState:
@@ -130,7 +130,7 @@ class Belief:
         return VehicleState.split(self.pose, self.mean[POSE:HEAD], covariance)
 
     def follow(self, motion: MeasuredMotion) -> None:
-        """Predict the pose after a motion, and update by a bias that was measured at rest."""
+        """Predict the pose by a motion, and update by a bias that was measured at rest."""
         self.predict(motion.odometry)
         if motion.bias is not None:
             measured, noise = np.array([motion.bias.value]), np.array([[motion.bias.sigma**2]])
@@ -173,13 +173,13 @@ class Belief:
         return transform(self.measuring(points), self.mean[columns], covariance)
 
     def measuring_columns(self, others: IntArray) -> IntArray:
-        """Return the entries of x that detections depend on: the pose, the sensor, and others (k,)."""
+        """Entries of x that detections depend on: pose, sensor, and others (k,)."""
         return np.concatenate([np.arange(POSE), SENSOR_COLUMNS, others])
 
     def measuring(self, points: IntArray) -> Callable[[Array], Array]:
         """Return the function from [pose | sensor | points] (k, d) to corrected detections of points (k,).
 
-        It is `R' (p - t) - C (b - b0)`, where b0 is the mean calibration by which they are corrected.
+        It is `R' (p - t) - C (b - b0)`, where b0 is the mean calibration of the correction.
         """
         expected = to_vehicle_rows(self.pose[None], self.points[points].reshape(1, -1)).reshape(-1, POINT)
         shift, now = self.by_sensor(expected).reshape(-1, SENSOR_SIZE), self.sensor.copy()
@@ -217,24 +217,24 @@ class Belief:
         )
 
     def reorder(self, points: IntArray) -> None:
-        """Put the points into another order, or keep some of them, by their indices (k,)."""
+        """Reorder or select points by their indices (k,)."""
         columns = np.concatenate([np.arange(HEAD), point_columns(points)])
         self.mean = self.mean[columns]
         self.covariance = self.covariance[np.ix_(columns, columns)]
 
 
 def point_columns(points: IntArray) -> IntArray:
-    """Return the entries (2 k,) of points (k,) in x."""
+    """Entries (2 k,) of points (k,) in x."""
     return (HEAD + POINT * points[:, None] + np.arange(POINT)).ravel()
 
 
 def to_map_rows(poses: Array, detections: Array) -> Array:
-    """Return `R z + t` (k, 2 r), map frame, of r detections (k, 2 r) from each of k poses (k, 3)."""
+    """Transform r detections (k, 2 r) from each of k poses (k, 3) to the map frame: `R z + t`."""
     repeated = np.repeat(poses, detections.shape[1] // POINT, axis=0)
     return to_map(detections.reshape(-1, POINT), repeated).reshape(len(poses), -1)
 
 
 def to_vehicle_rows(poses: Array, points: Array) -> Array:
-    """Return `R' (p - t)` (k, 2 r), vehicle frame, of r map points (k, 2 r) from each of k poses (k, 3)."""
+    """Transform r map points (k, 2 r) to the vehicle frame of each of k poses (k, 3): `R' (p - t)`."""
     repeated = np.repeat(poses, points.shape[1] // POINT, axis=0)
     return to_vehicle(points.reshape(-1, POINT), repeated).reshape(len(poses), -1)

@@ -1,4 +1,4 @@
-"""The paper's state, a pose and control points of clamped splines, and its growth (paper: Expansion)."""
+"""The paper's state, pose and control points of clamped splines, and its growth (paper: Expansion)."""
 
 from typing import Final
 
@@ -20,11 +20,11 @@ from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
-SIGMA_START: Final = 0.3  # of a new curve's control points (m), beyond that of its detections
+SIGMA_START: Final = 0.3  # added standard deviation of a new curve's control points (m)
 
 
 def in_map(detections: Detections, pose: Array) -> tuple[Array, Array]:
-    """Return points (m, 2) and covariances (m, 2, 2) of detections from a pose (3,), map frame."""
+    """Transform detections from a pose (3,) to the map frame: points (m, 2) and covariances (m, 2, 2)."""
     turned = rotated(detections.covariances, np.full(len(detections.labels), pose[2]))
     return to_map(detections.points_vehicle, pose[None]), turned
 
@@ -35,7 +35,7 @@ class CurveState:
     def __init__(self, belief: Belief, settings: MapperSettings) -> None:
         self.settings = settings
         self.belief = belief  # mean and covariance of x
-        self.curves: dict[int, BSpline] = {}  # by label; control points: only their number is current
+        self.curves: dict[int, BSpline] = {}  # by label; knots are current, control points are in the belief
         self.pose_u: dict[int, float] = {}  # parameter of the vehicle's foot point on each curve, not wrapped
 
     @property
@@ -43,20 +43,20 @@ class CurveState:
         return self.belief.pose
 
     def offset(self, label: int) -> int:
-        """Return the number of points in x before a curve's first control point."""
+        """Number of points in x before a curve's first control point."""
         return sum(curve.size for other, curve in self.curves.items() if other < label)
 
     def control_points(self, label: int) -> Array:
-        """Return a view of the distinct control points (m, 2) of a curve in m, map frame."""
+        """View of the distinct control points (m, 2) of a curve in m, map frame."""
         start = self.offset(label)
         return self.belief.points[start : start + self.curves[label].size]
 
     def columns(self, label: int, control: IntArray) -> IntArray:
-        """Return the entries (2 k,) of x that are control points (k,) of a curve."""
+        """Entries (2 k,) of control points (k,) of a curve in x."""
         return point_columns(self.offset(label) + control)
 
     def covariance(self, label: int) -> Array:
-        """Return the joint covariance (2m, 2m) of a curve's control points in m^2: a copy."""
+        """Copy of the joint covariance (2m, 2m) of a curve's control points in m^2."""
         columns = self.columns(label, np.arange(self.curves[label].size))
         return self.belief.covariance[np.ix_(columns, columns)]
 
@@ -64,13 +64,13 @@ class CurveState:
         return self.curves[label].with_points(self.control_points(label).copy())
 
     def foot_points(self, label: int, points: Array, low: Array, high: Array) -> FootPoints:
-        """Return the foot points of points (m, 2) in the stretches [low, high] (m,) of a curve."""
+        """Find the foot points of points (m, 2) in the stretches [low, high] (m,) of a curve."""
         curve, s = self.spline(label), self.settings.spline
         search = s.search_step, s.search_iterations
         return foot_points(curve.tables, curve.control_points, points, low, high, *search)
 
     def locate_vehicle(self) -> None:
-        """Update the vehicle's parameter on each curve: near the last one, or anywhere if it has left."""
+        """Update the vehicle's parameter on each curve: near the last one, or everywhere if it is far off."""
         gate = self.settings.gate
         heading = np.array([np.cos(self.pose[2]), np.sin(self.pose[2])])
         for label, last in self.pose_u.items():
@@ -85,12 +85,12 @@ class CurveState:
             self.pose_u[label] = u
 
     def visible_range(self, label: int, count: int) -> tuple[Array, Array]:
-        """Return the limits of the stretch of a curve that the vehicle sees, each `count` times."""
+        """Limits of the stretch of a curve that the vehicle sees, each `count` times."""
         gate, u = self.settings.gate, self.pose_u[label]
         return np.full(count, u - gate.view_behind), np.full(count, u + gate.view_ahead)
 
     def begin(self, label: int, detections: Array, covariances: Array) -> None:
-        """Begin a clamped curve of one span along the polyline of detections (k >= 2, 2), vehicle frame."""
+        """Begin a clamped curve of one span along a polyline of detections (k >= 2, 2), vehicle frame."""
         belief, p, k = self.belief, self.settings.spline.degree, len(detections)
         count = len(belief.points)
         belief.add_points(detections, covariances)
@@ -124,7 +124,7 @@ class CurveState:
         self.belief.update(self.columns(label, last), lambda x: x @ matrix.T, np.zeros(len(matrix)), noise)
 
     def _append_points(self, label: int, curve: BSpline, added: int) -> None:
-        """Move the last `added` points of x to the end of a curve, whose knots are now those of `curve`."""
+        """Move the last `added` points of x to the end of a curve, which takes the knots of `curve`."""
         self.curves = dict(sorted({**self.curves, label: curve}.items()))
         end, count = self.offset(label) + curve.size, len(self.belief.points)
         order = np.arange(count - added)
@@ -137,31 +137,31 @@ class CurveState:
         self.curves[label] = curve
 
     def boundary(self, label: int) -> Boundary:
-        """Return a curve as the boundary that registration and simplification take; its end is confirmed."""
+        """Convert a curve to a confirmed boundary, for registration and simplification."""
         curve, settings = self.curves[label], self.settings
         boundary = Boundary(curve.knots, curve.periodic, settings.spline, settings.gauge)
         boundary.confirmed_end = boundary.tables.high
         return boundary
 
 
-LONGEST_EXTENSION: Final = 12.0  # an extension is at most this long (m), so a longer one takes several
-SIGMA_CARRY: Final = 1.0  # of the control point that carries on a stranded end (m)
-RECENT_CONES: Final = 40  # last cones with which a confirmed track is compared
-END_TOLERANCE_U: Final = 1e-6  # a foot point within this distance (m) of the end's parameter is at the end
+LONGEST_EXTENSION: Final = 12.0  # largest length of one extension (m)
+SIGMA_CARRY: Final = 1.0  # standard deviation of the control point of an extrapolated end (m)
+RECENT_CONES: Final = 40  # number of last cones with which a confirmed track is compared
+END_TOLERANCE_U: Final = 1e-6  # tolerance of a foot point at the end of a curve (m)
 
 
 class Expansion:
-    """Expands curves by detections of confirmed tracks that come next along the path.
+    """Expands curves by the next detections of confirmed tracks along the path.
 
-    An end that the vehicle has passed is extended beside the path.
+    An end that the vehicle has passed is extrapolated beside the path.
     """
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
         self.tentative = {label: TentativeTracks(settings.growth) for label in BOUNDARIES}
         self.observed: dict[int, list[Array]] = {label: [] for label in BOUNDARIES}
-        """All distinct cones that were confirmed, as points (2,) in m, map frame, by label."""
-        self._carried = dict.fromkeys(BOUNDARIES, 0.0)  # lengths (m) since the last cone
+        """Distinct confirmed cones, as points (2,) in m, map frame, by label."""
+        self._carried = dict.fromkeys(BOUNDARIES, 0.0)  # extrapolated lengths since the last cone (m)
 
     def observe(self, state: CurveState, detections: Detections) -> None:
         """Add all detections of a cycle to the tracks, and newly confirmed ones to the observed cones."""
@@ -176,7 +176,7 @@ class Expansion:
     def expand(
         self, state: CurveState, detections: Detections, path_ahead: PathAhead, free: BoolArray
     ) -> set[int]:
-        """Begin or extend each curve by detections that update none (`free` (m,)); return which grew."""
+        """Begin or extend each curve by `free` detections (m,), which update none; return grown curves."""
         extended: set[int] = set()
         for label in BOUNDARIES:
             rows = np.flatnonzero(free & (detections.labels == label))
@@ -211,7 +211,7 @@ class Expansion:
         return found.where(chain(found, end))
 
     def _undisputed(self, label: int, indices: IntArray) -> IntArray:
-        """Return the tracks with at least as many detections as those of the other label around them."""
+        """Select tracks with at least as many detections as the tracks of the other label around them."""
         tracks, other = self.tentative[label], self.tentative[LEFT + RIGHT - label]
         offset = tracks.points[indices, None] - other.points
         near = np.hypot(offset[..., 0], offset[..., 1]) < self.settings.growth.merge_radius
@@ -225,7 +225,7 @@ class Expansion:
         return ahead & beyond_end(found.points, foot.u, high, control_points, self.settings.ckf)
 
     def _extend(self, state: CurveState, label: int, detections: Detections, found: Candidates) -> bool:
-        """Extend a curve to the last candidate of the proximity chain; return whether there is any."""
+        """Extend a curve to the last candidate of the proximity chain; return whether there is one."""
         if len(found.points) == 0:
             return False
         last = state.control_points(label)[-1].copy()
@@ -245,7 +245,7 @@ class Expansion:
         return np.asarray(detections.covariances[rows] + model)
 
     def _carry_on(self, state: CurveState, label: int, path_ahead: PathAhead) -> bool:
-        """Extend a curve whose end the vehicle has passed beside the path, nearly as far as the vehicle."""
+        """Extrapolate a passed end beside the path, nearly up to the vehicle; return whether it grew."""
         settings = self.settings.growth
         end = _end(state, label, path_ahead)
         if end.station >= path_ahead.driven - path.STRANDED:
@@ -264,10 +264,10 @@ class Expansion:
 def beyond_end(
     points: Array, u: Array, high: float, control_points: Array, settings: CkfSettings
 ) -> BoolArray:
-    """Return which points (m, 2) with foot points at u (m,) meet the paper's three conditions.
+    """Whether points (m, 2) with foot points u (m,) meet the paper's three conditions of growth.
 
-    The foot point is the end `high`; the point is farther from `C_n` than the growth threshold, and farther
-    from `C_{n-1}` than the separation.
+    The foot point is the end `high`, the distance from `C_n` exceeds the growth threshold, and the distance
+    from `C_{n-1}` exceeds the separation.
     """
     at_end = u >= high - END_TOLERANCE_U
     far = np.hypot(*(points - control_points[-1]).T) > settings.threshold
@@ -276,7 +276,7 @@ def beyond_end(
 
 
 def proximity_chain(points: Array, start: Array) -> IntArray:
-    """Return the order (k,) of points (k, 2), each the nearest to the last; it begins at `start` (2,)."""
+    """Order points (k, 2) from `start` (2,) on, each the nearest one to the last; return indices (k,)."""
     remaining, order, last = list(range(len(points))), [], start
     while remaining:
         distances = np.hypot(*(points[remaining] - last).T)
@@ -286,7 +286,7 @@ def proximity_chain(points: Array, start: Array) -> IntArray:
 
 
 def _end(state: CurveState, label: int, path_ahead: PathAhead) -> End:
-    """Return the end of a curve relative to the path."""
+    """Locate the end of a curve on the path."""
     position = state.control_points(label)[-1].copy()
     station, lateral = path_ahead.since(path_ahead.driven - END_BEHIND).locate(position[None])
     return End(position, float(station[0]), SIDES[label] * float(lateral[0]))

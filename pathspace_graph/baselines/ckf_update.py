@@ -1,6 +1,6 @@
-"""Classifies the detections of a cycle, and makes its one Kalman update (paper: Expansion, Update).
+"""Classification of the detections of a cycle, and its one Kalman update (paper: Expansion, Update).
 
-What the paper leaves open, and what was chosen, is in `docs/paper.md`, "Decisions of the filter".
+`docs/paper.md`, "Decisions of the filter", lists our choices where the paper leaves them open.
 """
 
 from dataclasses import dataclass
@@ -22,13 +22,13 @@ from pathspace_graph.settings.mapper import CkfSettings
 
 from .ckf_curves import CurveState
 
-GAIN_RANK: Final = 1e-9  # singular values of the gain below this share of the largest one count as zero
+GAIN_RANK: Final = 1e-9  # least singular value of the gain that is not zero, relative to the largest one
 LEAST_BASIS: Final = 1e-3  # least sum of a control point's basis values for its update
 
 
 @dataclass(frozen=True, eq=False)
 class OnCurve:
-    """The detections of a cycle that update a curve."""
+    """Detections of a cycle that update a curve."""
 
     rows: IntArray  # (m,) rows of the cycle's detections
     basis: Array  # (m, n) the curve's n basis functions at the foot points: the paper's B
@@ -40,7 +40,7 @@ class OnCurve:
 
 
 def classify(state: CurveState, detections: Detections) -> dict[int, OnCurve]:
-    """Return the detections that update each curve; one with an unknown label updates the nearer curve."""
+    """Assign detections to the curves that they update; an unknown label updates the nearer curve."""
     found = {label: on_curve(state, label, detections) for label in state.curves}
     nearest = np.full(len(detections.labels), np.inf)
     for on in found.values():
@@ -49,11 +49,11 @@ def classify(state: CurveState, detections: Detections) -> dict[int, OnCurve]:
 
 
 def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
-    """Return the detections within the gate of a curve: `d^2 < chi^2 (n' K n + sigma^2 + g' Sigma g)`.
+    """Select the detections in the gate of a curve: `d^2 < chi^2 (n' K n + sigma^2 + g' Sigma g)`.
 
     d is the signed distance across the curve, n its normal, K the covariance of the detection, sigma^2 the
     variances of the settings, g the derivative of d by pose, calibration and control points, and Sigma their
-    covariance. The foot point is inside the stretch that the vehicle sees.
+    covariance. The foot point must be inside the stretch that the vehicle sees.
     """
     gate, curve = state.settings.gate, state.curves[label]
     rows = np.flatnonzero((detections.labels == label) | (detections.labels == UNKNOWN))
@@ -82,31 +82,31 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
 
 @dataclass(frozen=True, eq=False)
 class SplineMeasurement:
-    """S_z on r control points, in the frame of the detections."""
+    """The measurement S_z on r control points, in the frame of the detections."""
 
     points: Array  # (r, 2) control points of S_z, in m
     covariance: Array  # (2 r, 2 r) their covariance over x0, y0, x1, y1 and so on, in m^2
-    gain: Array  # (r, m) G, the derivative of S_z by the detections
-    taken: Array  # (r, r) G B, the derivative of S_z by control points whose curve the detections lie on
+    gain: Array  # (r, m) G, derivative of S_z by the detections
+    taken: Array  # (r, r) G B, derivative of S_z by the control points of a curve through the detections
     known: Array  # (r, 2) control points C_mu before the fit
 
     def refitted(self, points: Array) -> Array:
-        """Return `C_mu + G B (C - C_mu)`: the S_z of detections on curves with control points (k, r, 2)."""
+        """S_z of detections on curves with control points C (k, r, 2): `C_mu + G B (C - C_mu)`."""
         return np.asarray(self.known + np.einsum("ij,kjd->kid", self.taken, points - self.known))
 
     def range_basis(self) -> Array:
-        """Return an orthonormal basis (r, q) of the range of G: all that the detections can change."""
+        """Orthonormal basis (r, q) of the range of G, which the detections can change."""
         vectors, values, _ = np.linalg.svd(self.gain, full_matrices=False)
         return np.asarray(vectors[:, values > GAIN_RANK * values[0]])
 
 
 def regularization(basis: Array, settings: CkfSettings) -> Array:
-    """Return `L = lambda diag(1 - B' 1 / m)` (r, r) of the basis B (m, r)."""
+    """Regularization `L = lambda diag(1 - B' 1 / m)` (r, r) for a basis B (m, r)."""
     return np.diag(settings.ridge * (1.0 - basis.mean(axis=0)))
 
 
 def ridge_gain(basis: Array, settings: CkfSettings) -> Array:
-    """Return `G = (B' B + L)^-1 B'` (r, m): the ridge regression is `C = C_mu + G (y - B C_mu)`."""
+    """Gain `G = (B' B + L)^-1 B'` (r, m) of the ridge regression `C = C_mu + G (y - B C_mu)`."""
     gram = basis.T @ basis + regularization(basis, settings)
     return np.asarray(np.linalg.lstsq(gram, basis.T, rcond=None)[0])
 
@@ -114,9 +114,9 @@ def ridge_gain(basis: Array, settings: CkfSettings) -> Array:
 def fit_detections(
     basis: Array, detections: Array, covariances: Array, known: Array, settings: CkfSettings
 ) -> SplineMeasurement:
-    """Fit S_z to detections (m, 2) with covariances (m, 2, 2): a cubature transform of the ridge regression.
+    """Fit S_z to detections (m, 2) with covariances (m, 2, 2), by a cubature transform of ridge regression.
 
-    basis (m, r) is evaluated at their foot points, known (r, 2) are the control points in their frame.
+    basis (m, r) is evaluated at their foot points; known (r, 2) are the control points in their frame.
     """
     m, r = basis.shape
     gain = ridge_gain(basis, settings)
@@ -134,16 +134,16 @@ def fit_detections(
 
 @dataclass(frozen=True, eq=False)
 class CurveBlock:
-    """The block of the measurement that is the S_z of one curve."""
+    """Block of the measurement for one curve."""
 
     columns: IntArray  # (2 r,) entries of the state that are the measured control points
     fitted: SplineMeasurement  # S_z in the vehicle frame
     combinations: Array  # (2 r, q) linear combinations of the coordinates of S_z that are measured
-    by_sensor: Array  # (2 r, 5) derivative of S_z by the calibration of the sensor, as it corrects detections
+    by_sensor: Array  # (2 r, 5) derivative of S_z by the calibration of the sensor
 
 
 def update(state: CurveState, detections: Detections, found: dict[int, OnCurve]) -> None:
-    """Fit S_z of each curve, and make one Kalman update of pose and map with all of them."""
+    """Fit S_z of each curve, and update pose and map by all of them at once."""
     blocks = [_fit(state, label, detections, on) for label, on in found.items() if len(on.rows)]
     if not blocks:
         return
@@ -164,7 +164,7 @@ def update(state: CurveState, detections: Detections, found: dict[int, OnCurve])
 
 
 def _fit(state: CurveState, label: int, detections: Detections, on: OnCurve) -> CurveBlock:
-    """Return S_z of one curve, on the control points that the detections reach.
+    """Fit S_z of one curve, on the control points that the detections reach.
 
     Their covariances are `K + sigma_model^2 I + sigma_along^2 t t'`, vehicle frame, with unit tangents t.
     """

@@ -1,4 +1,4 @@
-"""The paper's filters: that of splines, which closes its loop, and its landmark baseline (paper: Results)."""
+"""The paper's filters: the spline filter, which closes its loop, and its landmark baseline (Results)."""
 
 from typing import ClassVar, Final
 
@@ -32,13 +32,15 @@ from .landmark_association import ROUGH_GATE, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 from .online import FRONT_END, OnlineBaseline
 
-FILTER_REACH: Final = 9.0  # how far ahead of the vehicle a curve is extended (m along the predicted path)
-SIGMA_TIE: Final = 0.15  # of the distance between the ends of a curve where the loop closes (m)
+FILTER_REACH: Final = (
+    9.0  # largest distance ahead of the vehicle of a curve's end (m along the predicted path)
+)
+SIGMA_TIE: Final = 0.15  # standard deviation of the distance between the ends of a curve at closure (m)
 TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
 
 class _Filter(OnlineBaseline):
-    """What both filters share."""
+    """Belief of both filters."""
 
     def _begin(self) -> None:
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
@@ -93,7 +95,7 @@ class CkfMapper(_Filter):
         return classify(self.state, detections) if extended else found
 
     def _close(self, detections: Detections) -> None:
-        """Look for the early segment after the shortest lap, and close and simplify both curves there."""
+        """Search the early segment after the shortest lap; close and simplify both curves there."""
         settings, state = self.settings.closing, self.state
         if self.closed:
             return
@@ -118,7 +120,7 @@ class CkfMapper(_Filter):
 
 
 class EarlySegmentSettings(ClosingSettings, group="closing"):
-    """The registration of a filter, which is less certain than online, and closes the loop in the end."""
+    """Registration of a filter: less certain than online, with wider limits after some patience."""
 
     sigma_reading: ClassVar[float] = 0.6
     patience: ClassVar[float] = 30.0
@@ -128,7 +130,7 @@ class EarlySegmentSettings(ClosingSettings, group="closing"):
 def associate_early_segment(
     state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array
 ) -> Motion | None:
-    """Return the motion that moves the newest detections onto the beginning of the curves, or None."""
+    """Find the motion of the newest detections onto the beginning of the curves; None without a sure one."""
     closing = EarlySegmentSettings(**vars(state.settings.closing))
     track = CurveMap(state.settings)
     for label in state.curves:
@@ -136,7 +138,7 @@ def associate_early_segment(
     for cycle, (pose, detections) in enumerate(cycles):
         track.variables.insert(pose_keys(np.array([cycle])), pose)
         track.detections.append(detections, cycle)
-    track.detections.used[:] = True  # a filter keeps no record of what its curves explained
+    track.detections.used[:] = True  # a filter does not record which detections its curves explained
     times = [detections.t for _, detections in cycles]
     covariance = state.belief.covariance[:POSE, :POSE]
     found = registration.register(track, times, covariance, beginning, closing)
@@ -144,11 +146,11 @@ def associate_early_segment(
 
 
 def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
-    """Make one Kalman update: the end of each curve lies on its beginning, at the correspondences.
+    """Update by the correspondences of the end of each curve and its beginning, in one Kalman update.
 
-    `n . (S(u) - S(w)) = 0` with sigma `SIGMA_TIE`, where the motion moves S(u) on S(w), with the normal n.
+    `n . (S(u) - S(w)) = 0` with sigma `SIGMA_TIE`, where the motion moves S(u) onto S(w), with the normal n.
     Along the tangent all k correspondences are one result of the registration, so each has sqrt(k) times its
-    sigma. False, and nothing is done, if an end has not reached its beginning yet.
+    sigma. Return False, without an update, if an end has not reached its beginning yet.
     """
     overlaps = {label: _overlap(state, label, motion) for label in state.curves}
     if not all(len(u) for u, _ in overlaps.values()):
@@ -171,7 +173,7 @@ def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
 
 
 def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Array]:
-    """Return parameters (k,) near the end of a curve, and those (k,) of the points they are moved on."""
+    """Return parameters (k,) near the end of a curve, and of their correspondences at the beginning (k,)."""
     spline = state.spline(label)
     high = spline.domain[1]
     u = np.arange(max(high - registration.BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
@@ -204,10 +206,10 @@ class LandmarkCkf(_Filter):
     """Maps cones as points: predict, associate, update, create.
 
     The paper's baseline has "a similarly structured state and overall implementation style", with the
-    Mahalanobis distance as the cost of the assignment (section Results). What it leaves open makes it no
-    weaker than need be: the gates are those of the landmark graph, labels must agree, a track becomes a
-    landmark after `ckf.sightings` detections, and the odometry is calibrated. Landmarks are never merged, and
-    the loop never closes, so ghosts stay.
+    Mahalanobis distance as the cost of the assignment (section Results). Our choices for the rest do not
+    weaken it: the gates are those of the landmark graph, labels must agree, a track becomes a landmark after
+    `ckf.sightings` detections, and the odometry is calibrated. Landmarks are never merged, and the loop never
+    closes, so duplicates remain.
     """
 
     READS: ClassVar = (*FRONT_END, "ckf")

@@ -1,10 +1,10 @@
-"""Which detection is of which landmark, by the Hungarian assignment, and which landmarks are one cone."""
+"""Association of detections with landmarks by Hungarian assignment, and of landmarks of one cone."""
 
 from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-import scipy  # which imports its modules when they are used
+import scipy  # imports its modules on first use
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
@@ -18,21 +18,19 @@ from pathspace_graph.settings.online import GrowthSettings
 
 from .landmark_map import AMBIGUOUS, SIGMA_MERGE, UNASSOCIATED, LandmarkSmoother, LandmarkState, two_rows
 
-ROUGH_GATE: Final = 5.0  # a landmark farther from all detections of a cycle (m) is not tested
-HELD_MARGIN: Final = 1e-9  # of a held pair below the match gate, where round-off would decide
-
-
-MATCH: Final = 0.95  # probability of the gate inside which a detection may be of a landmark
-CREATE: Final = 0.99  # of the gates of all landmarks outside of which a detection may be new
-MATCH_GATE: Final = chi2_quantile(MATCH, POINT)  # on squared Mahalanobis distances, as is the next one
-CREATE_GATE: Final = chi2_quantile(CREATE, POINT)
+ROUGH_GATE: Final = 5.0  # largest distance of a tested landmark from a detection of the cycle (m)
+HELD_MARGIN: Final = 1e-9  # margin of a previous pair below the match gate, against round-off
+MATCH: Final = 0.95  # probability of the gate of a match
+CREATE: Final = 0.99  # probability of the gates outside of which a detection may be new
+MATCH_GATE: Final = chi2_quantile(MATCH, POINT)  # gate of a match (squared Mahalanobis distance)
+CREATE_GATE: Final = chi2_quantile(CREATE, POINT)  # gate outside of which a detection may be new
 
 
 def associate(cost: Array) -> tuple[IntArray, BoolArray]:
     """Minimize `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
 
     cost (m, n) are squared Mahalanobis distances of detections to landmarks, infinite for other labels.
-    Return the column (m,) of each landmark, or UNASSOCIATED, and which detections (m,) may create one.
+    Return the column (m,) of each landmark, or UNASSOCIATED, and whether detections (m,) may create one.
     """
     landmark = np.full(len(cost), UNASSOCIATED, np.intp)
     rows, columns = scipy.optimize.linear_sum_assignment(np.minimum(cost, MATCH_GATE))
@@ -42,14 +40,14 @@ def associate(cost: Array) -> tuple[IntArray, BoolArray]:
 
 
 def squared_mahalanobis(innovations: Array, covariances: Array) -> Array:
-    """Return `r' S^-1 r` (...,) of innovations (..., 2) with covariances (..., 2, 2), in closed form."""
+    """Compute `r' S^-1 r` (...,) for innovations (..., 2) with covariances (..., 2, 2), in closed form."""
     x, y = innovations[..., 0], innovations[..., 1]
     xx, xy, yy = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
     return np.asarray((yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy))
 
 
 def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_covariances: Array) -> Array:
-    """Return the squared Mahalanobis distances (m, n) of detections (m, 2) and predicted ones (n, 2).
+    """Squared Mahalanobis distances (m, n) of detections (m, 2) and predicted ones (n, 2).
 
     Their covariances are (m, 2, 2) and (n, 2, 2).
     """
@@ -58,21 +56,21 @@ def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_co
 
 
 def hysteresis_costs(cost: Array, held: BoolArray) -> Array:
-    """Return the costs, where `held` pairs stay in the match gate up to the create gate, lest they flip."""
+    """Keep previous (`held`) pairs in the match gate up to the create gate, so that they do not flip."""
     inside = (1.0 - HELD_MARGIN) * MATCH_GATE
     return np.where(held & (cost < CREATE_GATE), np.minimum(cost, inside), cost)
 
 
 def compatible(labels: IntArray, landmark_labels: IntArray) -> BoolArray:
-    """Return for each pair (m, n) whether the detection has the landmark's label or an unknown one."""
+    """Whether the detection of each pair (m, n) has the landmark's label or an unknown one."""
     return np.asarray((labels[:, None] == landmark_labels[None]) | (labels == UNKNOWN)[:, None])
 
 
 def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray) -> None:
     """Associate the rows `new` of the newest pose with eligible (n,) landmarks.
 
-    A detection between the gates becomes AMBIGUOUS, and so does one in the match gate of a landmark with
-    another label, for whose own label it votes.
+    A detection between the gates becomes AMBIGUOUS. So does a detection in the match gate of a landmark with
+    another label, and votes for its own label.
     """
     detections, state = smoother.map.detections, smoother.map.state
     rows = np.arange(new.start, new.stop)
@@ -93,10 +91,10 @@ def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray
 
 
 def predict(smoother: LandmarkSmoother, landmarks: IntArray) -> tuple[Array, Array]:
-    """Return where landmarks (k,), by position, should be detected from the newest pose.
+    """Predict detections of landmarks (k,), by position, from the newest pose.
 
-    The places (k, 2) are in m, vehicle frame, with covariances `H_j Sigma H_j'` (k, 2, 2), Sigma that of pose
-    and landmark in the last step, zero before the first one.
+    They (k, 2) are in m, vehicle frame, with covariances `H_j Sigma H_j'` (k, 2, 2). Sigma is the covariance
+    of pose and landmark in the last step, and zero before the first one.
     """
     state, k = smoother.map.state, len(landmarks)
     cycles = np.full(k, smoother.next_cycle - 1)
@@ -116,7 +114,7 @@ def associate_created(
 ) -> tuple[IntArray, IntArray]:
     """Return the rows of detections (m, 2) that belong to new landmarks (k, 2), and the landmark of each.
 
-    One belongs to the nearest landmark within the merge radius, and only the nearest of each cycle (m,) does.
+    A detection belongs to the nearest landmark within the merge radius, if it is the nearest of its cycle.
     """
     if len(points) == 0 or len(landmarks) == 0:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
@@ -131,7 +129,7 @@ def associate_created(
 def find_duplicates(
     state: LandmarkState, known: int, covariance: Callable[[IntArray], Array], settings: MapperSettings
 ) -> tuple[IntArray, IntArray]:
-    """Return the positions (k,) of landmarks, and of the older landmarks of the same cone."""
+    """Find duplicates: the positions (k,) of landmarks, and of older landmarks of the same cone."""
     newer, older = pairs_within(state.landmarks[:known], state.labels[:known], settings.growth.merge_radius)
     involved, index = np.unique(np.concatenate([newer, older]), return_inverse=True)
     if len(involved) == 0:
@@ -143,7 +141,7 @@ def find_duplicates(
 
 
 def pairs_within(landmarks: Array, labels: IntArray, radius: float) -> tuple[IntArray, IntArray]:
-    """Return the indices (k,) of landmarks, and of older ones of the same label within `radius` (m)."""
+    """Indices (k,) of landmarks, and of older ones of the same label within `radius` (m)."""
     offset = landmarks[:, None] - landmarks[None]
     near = (np.hypot(offset[..., 0], offset[..., 1]) < radius) & (labels[:, None] == labels[None])
     newer, older = np.nonzero(np.tril(near, -1))
@@ -151,14 +149,14 @@ def pairs_within(landmarks: Array, labels: IntArray, radius: float) -> tuple[Int
 
 
 def difference_covariances(joint: Array, i: IntArray, j: IntArray) -> Array:
-    """Return the covariances (..., 2, 2) of the differences of points i and j (...,), plus `SIGMA_MERGE`."""
+    """Covariances (..., 2, 2) of the differences of points i and j (...,), plus that of `SIGMA_MERGE`."""
     blocks = joint.reshape(len(joint) // POINT, POINT, -1, POINT)
     spread = blocks[i, :, i] + blocks[j, :, j] - blocks[i, :, j] - blocks[j, :, i]
     return np.asarray(spread + SIGMA_MERGE**2 * np.eye(POINT))
 
 
 def compatible_pairs(newer: IntArray, older: IntArray, offset: Array, covariances: Array) -> IntArray:
-    """Return the indices of the pairs (k,) in the match gate, nearest first, one for each landmark."""
+    """Select pairs (k,) in the match gate by index, nearest first, one for each landmark."""
     distance = squared_mahalanobis(offset, covariances)
     taken: set[int] = set()
     chosen = []
@@ -171,7 +169,7 @@ def compatible_pairs(newer: IntArray, older: IntArray, offset: Array, covariance
 
 
 def merge(smoother: LandmarkSmoother, gone: IntArray, kept: IntArray) -> None:
-    """Merge the landmarks at positions `gone` (k,) into those at `kept` (k,), and make one step."""
+    """Merge the landmarks at positions `gone` (k,) into those at `kept` (k,), and take one step."""
     keys = smoother.map.state.keys
     merge_points(smoother, keys[gone], keys[kept])
     smoother.map.merge(gone, kept)

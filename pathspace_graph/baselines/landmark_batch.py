@@ -1,6 +1,7 @@
-"""The Hungarian landmark graph over a whole log: all poses and landmarks at once, associations refreshed.
+"""The Hungarian landmark graph over a whole log: all poses and landmarks at once, with iterated associations.
 
-With oracle associations it gives the limit of a run, without robust weights, since there are no outliers.
+With oracle associations it is the limit of accuracy of a log. There are no outliers then, and no robust
+weights.
 """
 
 from dataclasses import dataclass, replace
@@ -36,15 +37,15 @@ from .landmark_association import MATCH_GATE, find_duplicates
 from .landmark_fixed_lag import LandmarkFixedLag
 from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landmark_rows, point_map
 
-LANDMARK_BATCH: Final = "landmark-batch"  # the estimator's name on the command line
-MAX_ROUNDS: Final = 10  # most rounds of associating all detections anew
+LANDMARK_BATCH: Final = "landmark-batch"  # name of the estimator on the command line
+MAX_ROUNDS: Final = 10  # largest number of rounds of association
 SETTLED_SHARE: Final = 1e-3  # largest share of detections that change their landmark in the last round
-MAX_STEPS: Final = 80  # most steps of a round's optimization
+MAX_STEPS: Final = 80  # largest number of steps in a round
 GAIN_TOLERANCE: Final = 1e-6  # largest relative gain of the last step
 
 
 class LandmarkBatch:
-    """Maps cones as points with all poses of a log; the start is the online run of `LandmarkFixedLag`."""
+    """Maps cones as points with all poses of a log, from the online run of `LandmarkFixedLag` on."""
 
     READS: ClassVar = LandmarkFixedLag.READS
 
@@ -53,7 +54,7 @@ class LandmarkBatch:
     ) -> None:
         self.settings = known_settings(settings)
         self.odometry_sigma = odometry_sigma
-        known_noise(odometry_sigma)  # a wrong one is refused here
+        known_noise(odometry_sigma)  # check it early
 
     def solve(self, log: Log) -> BatchRun:
         return solved(self._solve, log, self.settings)
@@ -108,18 +109,18 @@ class LandmarkSystem:
 
     @classmethod
     def of_log(cls, log: Log, settings: MapperSettings, noise: KnownNoise) -> "LandmarkSystem":
-        """Return the problem of a log without any association; `noise` is what is known before it."""
+        """Set up the problem of a log without associations; `noise` is known before the drive."""
         judged = judge_log(log, noise, settings)
         detections = LandmarkDetections.of(judged.cycles, twists=judged.chain.twists)
         return cls(detections, judged.chain, judged.settings, judged.noise)
 
     def cost(self, state: LandmarkState) -> float:
-        """Return half the sum of squares at a state, with Huber's loss of the detections."""
+        """Half the sum of squares at a state, with Huber's loss of the detections."""
         *drive, detections = self.rows(state, np.inf)
         return half_square(drive) + float(huber_loss(detections.residual, self.settings.gate.huber).sum())
 
     def rows(self, state: LandmarkState, huber: float) -> list[Rows]:
-        """Return all rows, those of the detections last, weighted by a Huber threshold (sigmas)."""
+        """All rows, those of the detections last, weighted by a Huber threshold (sigmas)."""
         rows = landmark_rows(state, self.detections, np.flatnonzero(self.detections.used), huber)
         labels = state.labels[state.positions(indices(rows.keys[:, -1]))]
         seen = replace(rows, owner=owners(rows.owner, labels == RIGHT))
@@ -130,7 +131,7 @@ class LandmarkSystem:
         return Elimination(graph, state.variables.layout)
 
     def optimize(self, state: LandmarkState) -> None:
-        """Move a state to the optimum by Levenberg-Marquardt; the associations stay, the map is damped."""
+        """Optimize a state by Levenberg-Marquardt with fixed associations; only the map is damped."""
         variables, cost, damping = state.variables, self.cost(state), Damping()
         for _ in range(MAX_STEPS):
             problem, before = self.eliminated(state), variables.values
@@ -148,7 +149,7 @@ class LandmarkSystem:
 
 
 def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[LandmarkSystem, LandmarkState]:
-    """Return the last map of the online run, with each pose and association as it left the window."""
+    """Return the last map of the online run, with each pose and association as of its end in the window."""
     online = LandmarkFixedLag(replace(system.settings, scale=1.0), noise)
     detections, smoother, track = system.detections, online.smoother, online.smoother.map
     poses = np.zeros((len(log.cycles), POSE))
@@ -160,7 +161,7 @@ def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[L
         poses[first : smoother.next_cycle] = smoother.variables.poses
         landmark[begins[first] : begins[first] + len(track.detections)] = track.detections.landmark
     final = np.arange(track.state.next_number)
-    for gone, kept in sorted(track.merged_into.items()):  # ascending, so that `kept` is final already
+    for gone, kept in sorted(track.merged_into.items()):  # ascending, so that `kept` is already final
         final[gone] = final[kept]
     rows = np.flatnonzero(landmark >= 0)
     detections.take(rows, final[landmark[rows]])
@@ -169,12 +170,12 @@ def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[L
     state.votes, state.next_number = track.state.votes, track.state.next_number
     insert_drive(state.variables, smoother.variables.calibrations, poses)
     sigma = np.array(online.inflated.odometry.sigmas)
-    chain = replace(system.chain, calibration_sigma=sigma)  # as the online run believed in the end
+    chain = replace(system.chain, calibration_sigma=sigma)  # priors at the end of the online run
     return replace(system, settings=online.inflated, chain=chain), state
 
 
 class Reassociation:
-    """Repeats the Hungarian assignment of every cycle, and creates landmarks from unassociated detections."""
+    """One more Hungarian assignment of every cycle; unassociated detections create landmarks."""
 
     def __init__(self, state: LandmarkState, system: LandmarkSystem, settings: MapperSettings) -> None:
         self.state, self.detections, self.settings = state, system.detections, settings
@@ -193,7 +194,7 @@ class Reassociation:
         starts = np.searchsorted(detections.cycle[rows], np.arange(len(self.stamps) + 1))
         for begin, end in pairwise(starts.tolist()):
             self._assign_cycle(rows[begin:end], landmarks[begin:end], cost[begin:end], free)
-        # a landmark with another label explains it, or one that a new landmark would be merged with
+        # do not create landmarks that one with another label explains, or that would be merged
         known = (cost < MATCH_GATE) | (distances < self.settings.growth.merge_radius)
         free[rows[known]] = False
         self._create(np.flatnonzero(free & ~detections.used))
@@ -210,7 +211,7 @@ class Reassociation:
         self.detections.take(detected[matched], self.state.numbers[candidates[landmark[matched]]])
 
     def _nearby_pairs(self) -> tuple[IntArray, IntArray, Array]:
-        """Return the detections (k,), ascending, landmarks and distances (m) of pairs in the rough gate."""
+        """Pairs in the rough gate: detections (k,), ascending, landmarks, and distances (m)."""
         points, tree = KDTree(self.points_map), KDTree(self.state.landmarks)
         pairs = points.sparse_distance_matrix(tree, association.ROUGH_GATE, output_type="coo_matrix")
         order = np.argsort(pairs.row, kind="stable")
@@ -235,7 +236,7 @@ class Reassociation:
             detections.take(rows[chosen], numbers[landmark])
 
     def _confirmed(self, rows: IntArray) -> Array:
-        """Return the tracks (k, 2) with enough of these detections, map frame; a batch forgets none."""
+        """Tracks (k, 2) with enough of these detections, map frame; none is forgotten."""
         detections = self.detections
         tentative = TentativeTracks(replace(self.settings.growth, forget_after=np.inf))
         covariances = detections.covariances_map(rows, self.state.variables)
@@ -259,7 +260,7 @@ def relabel(
 
 
 def predicted_covariances(problem: Elimination, cycles: IntArray, keys: IntArray, jacobian: Array) -> Array:
-    """Return `J Sigma J'` (m, 2, 2), J (m, 2, 5) by [pose | landmark], of cycles (m,) and keys (m,)."""
+    """Compute `J Sigma J'` (m, 2, 2), J (m, 2, 5) by [pose | landmark], for cycles (m,) and keys (m,)."""
     landmark = problem.map.columns(keys)[:, None] + np.arange(POINT)
     pose = POSE * cycles[:, None] + np.arange(POSE)
     cross = problem.cross_covariance[pose[:, :, None], landmark[:, None, :]]
@@ -269,7 +270,7 @@ def predicted_covariances(problem: Elimination, cycles: IntArray, keys: IntArray
 
 
 def remove_rare(state: LandmarkState, detections: LandmarkDetections, fewest: int) -> None:
-    """Remove landmarks with fewer detections than `fewest`; those detections become unassociated."""
+    """Remove landmarks with fewer detections than `fewest`; their detections become unassociated."""
     counts = np.bincount(state.positions(detections.landmark[detections.used]), minlength=len(state))
     gone = counts < fewest
     detections.landmark[np.isin(detections.landmark, state.numbers[gone])] = UNASSOCIATED
@@ -280,10 +281,10 @@ def remove_rare(state: LandmarkState, detections: LandmarkDetections, fewest: in
 def solve_landmarks(
     log: Log, associations: IntArray, settings: MapperSettings | None = None
 ) -> tuple[LandmarkSystem, LandmarkState]:
-    """Minimize all squared Mahalanobis distances over poses, calibration and landmarks; no loss is robust.
+    """Minimize all squared Mahalanobis distances over poses, calibration and landmarks, without robust loss.
 
-    associations (R,) are the numbers of the detections' landmarks in file order; negative ones are left out,
-    and so are orange cones.
+    associations (R,) are the landmark numbers of all detections in file order. Negative ones and orange cones
+    are left out.
     """
     associations = associations[~np.concatenate([is_orange(cycle) for cycle in log.cycles])]
     settings = settings or MapperSettings()
@@ -295,7 +296,7 @@ def solve_landmarks(
 
 
 def start_oracle(system: LandmarkSystem, associations: IntArray) -> LandmarkState:
-    """Associate the system's detections with landmarks (R,), and return the state by dead reckoning."""
+    """Associate the system's detections with landmarks (R,); return the state by dead reckoning."""
     detections, rows = system.detections, np.flatnonzero(associations >= 0)
     numbers, first, landmark = np.unique(associations[rows], return_index=True, return_inverse=True)
     detections.take(rows, numbers[landmark])

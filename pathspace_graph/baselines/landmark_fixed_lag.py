@@ -1,6 +1,6 @@
 """The Hungarian landmark graph online: cones are points in the same fixed-lag smoother as the curves.
 
-The loop closes where enough of the landmarks seen now are those of the beginning. Their joint covariance
+The loop closes when enough of the recent landmarks are landmarks of the beginning. Their joint covariance
 tests a set of pairs as a whole (joint compatibility, Neira and Tardos 2001).
 """
 
@@ -30,16 +30,16 @@ from .landmark_association import CREATE, MATCH_GATE, difference_covariances
 from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
 from .online import FRONT_END, OnlineBaseline
 
-UNSEEN_PATH: Final = 40.0  # path (m) without a detection: a landmark is not associated near the start
-MIN_PAIRS: Final = 4  # recognized landmarks that close the loop, a third of them of each colour
-MIN_LEAD: Final = 2.0  # over any other set of pairs, where each landmark counts as one gate
+UNSEEN_PATH: Final = 40.0  # path without a detection after which a landmark is old (m)
+MIN_PAIRS: Final = 4  # least number of pairs that close the loop, a third of them of each colour
+MIN_LEAD: Final = 2.0  # least lead of the score over any other set of pairs, in gates
 
 
 class LandmarkFixedLag(OnlineBaseline):
     """Maps cones as points: predict, associate, create, update, close, marginalize.
 
-    Window, odometry and robust weights are those of `FixedLagMapper`, but each detection has one landmark in
-    place of a curve.
+    Window, odometry and robust weights are those of `FixedLagMapper`; each detection has a landmark instead
+    of a curve.
     """
 
     READS: ClassVar = (*FRONT_END, "lag", "max_poses", "relinearize", "steps", "steps_grown")
@@ -49,9 +49,11 @@ class LandmarkFixedLag(OnlineBaseline):
         self.smoother.window.exact = True
         self.path = DrivenPath()
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
-        self.inflated = self.settings  # settings with the priors of the calibrations as they are now
+        self.inflated = self.settings  # settings with the present priors of the calibrations
         self.closed = False
-        self._last_detected: Array = np.zeros(0)  # path driven (m) at each landmark's last sight, by number
+        self._last_detected: Array = np.zeros(
+            0
+        )  # path length at each landmark's last detection, by number (m)
         self._last_check = 0.0
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
@@ -73,7 +75,7 @@ class LandmarkFixedLag(OnlineBaseline):
 
     def _use(self, new: slice, t: float, watch: Stopwatch) -> None:
         eligible = np.ones(len(self.smoother.map.state), bool)
-        if not self.closed and self._near_start():  # one detection can't tell which old landmark it shows
+        if not self.closed and self._near_start():  # a single detection of an old landmark is ambiguous
             eligible = ~self._old()
         association.associate_newest(self.smoother, new, eligible)
         watch.lap("associate")
@@ -97,7 +99,7 @@ class LandmarkFixedLag(OnlineBaseline):
         return created
 
     def _add_landmarks(self, label: int, points: Array) -> None:
-        """Add landmarks at points (k, 2), and associate the detections in the window that created them."""
+        """Add landmarks at points (k, 2), and associate the detections of the window that created them."""
         detections, state = self.smoother.map.detections, self.smoother.map.state
         rows = np.flatnonzero((detections.label == label) & (detections.landmark == UNASSOCIATED))
         cycles = detections.cycle[rows]
@@ -116,7 +118,7 @@ class LandmarkFixedLag(OnlineBaseline):
         return np.asarray(last_detected < self.path.length - UNSEEN_PATH)
 
     def _close(self) -> None:
-        """Close the loop or, once it has closed, merge duplicates; this is tried every few metres."""
+        """Close the loop, or merge duplicates after closure, every few metres."""
         detections, state, length = self.smoother.map.detections, self.smoother.map.state, self.path.length
         detected = np.unique(detections.landmark[detections.used])
         unknown = np.zeros(state.next_number - len(self._last_detected))
@@ -174,7 +176,7 @@ class LandmarkFixedLag(OnlineBaseline):
 
 
 class JointCompatibility:
-    """Tests sets of pairs by the joint Gaussian of recent and old landmarks, all sigmas times `scale`."""
+    """Test of sets of pairs by the joint Gaussian of recent and old landmarks, all sigmas times `scale`."""
 
     def __init__(self, smoother: LandmarkSmoother, recent: IntArray, old: IntArray, scale: float) -> None:
         state = smoother.map.state
@@ -185,14 +187,14 @@ class JointCompatibility:
         self.same_label = state.labels[recent][:, None] == state.labels[old][None]
 
     def distances(self, mean: Array, covariance: Array) -> Array:
-        """Return the squared Mahalanobis distances (k, n) of all pairs; other labels give infinity."""
+        """Squared Mahalanobis distances (k, n) of all pairs, infinite for different labels."""
         k = len(self.recent)
         spread = difference_covariances(covariance, np.arange(k)[:, None], np.arange(k, len(mean)))
         squared = association.squared_mahalanobis(mean[:k, None] - mean[None, k:], spread)
         return np.where(self.same_label, squared, np.inf)
 
     def conditioned(self, mean: Array, covariance: Array, i: int, j: int) -> tuple[Array, Array]:
-        """Return the Gaussian given that recent landmark i is old landmark j: one Kalman update."""
+        """Condition the Gaussian on recent landmark i being old landmark j, by a Kalman update."""
         a, b = POINT * i, POINT * (len(self.recent) + j)
         cross = covariance[:, a : a + POINT] - covariance[:, b : b + POINT]
         spread = cross[a : a + POINT] - cross[b : b + POINT] + SIGMA_MERGE**2 * np.eye(POINT)
@@ -201,7 +203,7 @@ class JointCompatibility:
         return mean - (gain @ innovation).reshape(-1, POINT), covariance - gain @ cross.T
 
     def grow(self, i: int, j: int, gate: float) -> tuple[list[tuple[int, int]], float]:
-        """Return pairs, begun with one and grown by the best in the gate, and their squared distance."""
+        """Grow a set of pairs from (i, j) by best pairs in the gate; return it and its squared distance."""
         mean, covariance, total = self.mean, self.covariance, 0.0
         distances = self.distances(mean, covariance)
         free = np.ones(distances.shape, bool)
@@ -219,10 +221,10 @@ class JointCompatibility:
 def detect_loop(
     smoother: LandmarkSmoother, recent: IntArray, old: IntArray, reach: float
 ) -> tuple[IntArray, IntArray] | None:
-    """Return pairs (k,) of recent and old landmarks, within `reach` (m), that are one cone each.
+    """Find pairs (k,) of recent and old landmarks, within `reach` (m), of one cone each.
 
-    They are those of the best hypothesis, or None if it is not clear or too small. Its score is a gate for
-    each pair less the distance of all.
+    They are the best hypothesis; None if it is ambiguous or too small. The score of a hypothesis is one gate
+    for each pair, less its squared distance.
     """
     state, settings = smoother.map.state, smoother.map.settings
     old = old[nearest_within(state.landmarks[old], state.landmarks[recent], reach)[1]]
@@ -247,6 +249,6 @@ def detect_loop(
 
 
 def optimize_loop(smoother: LandmarkSmoother, recent: IntArray, old: IntArray) -> None:
-    """Solve the whole loop with pairs (k,) held together; merge them later."""
+    """Solve the whole loop with constraints between pairs (k,); merge them later."""
     smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([recent, old])]
     solve_loop(smoother, smoother.map.settings.closing.iterations, None)

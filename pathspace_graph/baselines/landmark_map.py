@@ -1,4 +1,4 @@
-"""The landmark map: landmarks with their variables, detections with associations, and two rows for each."""
+"""The landmark map: landmarks and their variables, detections with associations, and two rows for each."""
 
 from dataclasses import dataclass, field, replace
 from typing import Final, Self, TypeAlias
@@ -27,14 +27,14 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.settings.mapper import MapperSettings
 
-UNASSOCIATED: Final = -1  # landmark of a detection that has none, and that may create one
-AMBIGUOUS: Final = -2  # landmark of a detection that has none, and that must not create one
-SIGMA_MERGE: Final = 0.1  # of the distance of two landmarks of one cone (m), beyond their covariance
+UNASSOCIATED: Final = -1  # landmark of a detection without one, which may create one
+AMBIGUOUS: Final = -2  # landmark of a detection without one, which must not create one
+SIGMA_MERGE: Final = 0.1  # standard deviation of the distance of two landmarks of one cone (m)
 NO_PAIRS: IntArray = np.zeros((0, 2), np.intp)
 
 
 class LandmarkState:
-    """Landmarks, oldest first. A landmark's number is that of its key and never changes."""
+    """Landmarks, oldest first. The number of a landmark is that of its key and never changes."""
 
     def __init__(self) -> None:
         self.variables = Variables()  # landmarks, calibration and poses by key
@@ -58,15 +58,15 @@ class LandmarkState:
 
     @property
     def landmarks(self) -> Array:
-        """Return the landmarks (n, 2) in the map frame, in m: a view."""
+        """View of the landmarks (n, 2) in m, map frame."""
         return self.variables.block(LANDMARK_LETTER).reshape(-1, POINT)
 
     def positions(self, numbers: IntArray) -> IntArray:
-        """Return the position of each of these numbers, of any shape, all of which must be known."""
+        """Positions of landmarks by number, of any shape; all must exist."""
         return self.numbers.searchsorted(numbers)
 
     def add(self, points: Array, labels: IntArray, numbers: IntArray | None = None) -> IntArray:
-        """Add landmarks (k, 2) with labels (k,), by default with the next numbers, and return these (k,)."""
+        """Add landmarks (k, 2) with labels (k,), by default with the next numbers; return numbers (k,)."""
         new = self.next_number + np.arange(len(labels)) if numbers is None else numbers
         self.variables.insert(landmark_keys(new), points.ravel())
         self.numbers = np.concatenate([self.numbers, new])
@@ -76,20 +76,20 @@ class LandmarkState:
         return new
 
     def vote(self, labels: IntArray, numbers: IntArray) -> None:
-        """Count detections with labels (k,) on landmarks (k,), which take the label of their majority."""
+        """Count detections with labels (k,) on landmarks (k,), which take the majority's label."""
         known, rows = np.isin(labels, BOUNDARIES), np.arange(len(self))
         np.add.at(self.votes, (self.positions(numbers[known]), labels[known]), 1)
         most = self.votes.argmax(axis=1)
         self.labels = np.where(self.votes[rows, most] > self.votes[rows, self.labels], most, self.labels)
 
     def keep(self, stays: BoolArray) -> None:
-        """Remove the landmarks whose entry in `stays` (n,) is not set; the variables stay as they are."""
+        """Remove the landmarks whose entry in `stays` (n,) is not set, but not their variables."""
         self.numbers, self.labels, self.votes = self.numbers[stays], self.labels[stays], self.votes[stays]
 
 
 @dataclass
 class LandmarkDetections(DetectionColumns):
-    """Detections with the landmark that each of them is associated with."""
+    """Detections with their associations to landmarks."""
 
     landmark: IntArray = field(default_factory=lambda: np.zeros(0, np.intp))  # or UNASSOCIATED or AMBIGUOUS
 
@@ -112,7 +112,7 @@ class LandmarkDetections(DetectionColumns):
 
 
 class LandmarkMap:
-    """The landmarks and the detections of the window, as the engine sees them (`graph.window:MapRows`)."""
+    """The landmarks and the detections of the window, for the engine (`graph.window:MapRows`)."""
 
     reached_inactive = False  # no landmark is ever inactive
 
@@ -122,8 +122,8 @@ class LandmarkMap:
         self.variables = self.state.variables
         self.detections = LandmarkDetections()  # detections from the poses in the window
         self.twist: Array = np.zeros(POSE)  # (3,) at the newest detections (m/s, m/s, rad/s)
-        self.loop_pairs: IntArray = NO_PAIRS  # (k, 2) numbers, held together while the loop closes
-        self.merged_into: dict[int, int] = {}  # number that was kept by the one that was merged
+        self.loop_pairs: IntArray = NO_PAIRS  # (k, 2) numbers of pairs with constraints while the loop closes
+        self.merged_into: dict[int, int] = {}  # number of the remaining landmark, by that of the merged one
 
     def copy(self) -> Self:
         other = shallow(self)
@@ -161,7 +161,7 @@ class LandmarkMap:
         return []
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Return `(l_i - l_j) / sigma_merge`, two rows for each loop pair."""
+        """Rows `(l_i - l_j) / sigma_merge`, two for each loop pair."""
         if len(self.loop_pairs) == 0:
             return []
         pairs = self.state.landmarks[self.state.positions(self.loop_pairs)]
@@ -196,10 +196,10 @@ LandmarkSmoother: TypeAlias = FixedLagSmoother[LandmarkMap]
 def landmark_rows(
     state: LandmarkState, detections: LandmarkDetections, chosen: IntArray, huber: float
 ) -> Rows:
-    """Return the rows `w W (R^T (l - t) - z)` of associated detections (m,), with `W' W = K^-1`.
+    """Linearize `w W (R^T (l - t) - z)` for associated detections (m,), with `W' W = K^-1`.
 
-    w is the root of each row's Huber weight. The detections z are corrected by the sensor's calibration, the
-    residuals those of measured ones (`factors.sensor:restored`).
+    w is the root of each row's Huber weight. The detections z are corrected by the sensor's calibration; the
+    residuals are converted to those of measured detections (`factors.sensor:restored`).
     """
     cycles, numbers, sensor = detections.cycle[chosen], detections.landmark[chosen], state.variables.sensor
     poses, points = state.variables.poses_at(cycles), state.landmarks[state.positions(numbers)]
@@ -215,7 +215,7 @@ def landmark_rows(
 
 
 def two_rows(cycles: IntArray, numbers: IntArray, jacobian: Array, residual: Array) -> Rows:
-    """Return Jacobians (m, 2, n) and residuals (m, 2) as rows on [pose | landmark], owned by the cycles."""
+    """Convert Jacobians (m, 2, n) and residuals (m, 2) to rows on [pose | landmark], owned by the cycles."""
     sensor = [np.full(len(cycles), SENSOR_KEY)] if jacobian.shape[2] > POSE + POINT else []
     keys = np.stack([pose_keys(cycles), *sensor, landmark_keys(numbers)], axis=1)
     flat = jacobian.reshape(-1, jacobian.shape[2])
@@ -227,7 +227,7 @@ def landmark_counts(labels: IntArray) -> tuple[int, int]:
 
 
 def point_map(points: Array, labels: IntArray, joint: Array | None, closed: bool) -> Map:
-    """Return landmarks (n, 2) by label, each boundary with its block of the joint covariance (2 n, 2 n)."""
+    """Build a map of landmarks (n, 2) by label, with the blocks of the joint covariance (2 n, 2 n)."""
     boundaries, order = {}, [np.zeros(0, np.intp)]
     for label in BOUNDARIES:
         chosen = np.flatnonzero(labels == label)

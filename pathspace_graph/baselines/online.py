@@ -1,4 +1,4 @@
-"""What the online baselines share: the front end that the mapper has too, the scale, and the map's metres."""
+"""Base of the online baselines: the mapper's front end, and the scale of the scene."""
 
 from abc import abstractmethod
 from typing import Final
@@ -15,11 +15,11 @@ from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
 FRONT_END: Final = ("closing", "gate", "growth", "motion", "noise", "sides", "spline")
-"""Settings that the front end and the growth of landmarks read."""
+"""Settings of the front end and of the growth of landmarks."""
 
 
 class OnlineBaseline:
-    """Online estimator whose subclass maps the readings of the front end, at scale 1.
+    """Online estimator; a subclass maps the readings of the front end at scale 1.
 
     `odometry_sigma` (3,) is the standard deviation of a twist reading (m/s, m/s, rad/s).
     """
@@ -34,7 +34,7 @@ class OnlineBaseline:
 
     @abstractmethod
     def _begin(self) -> None:
-        """Make what only this estimator has."""
+        """Initialize the subclass."""
 
     def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
         watch = Stopwatch()

@@ -1,4 +1,4 @@
-"""Where the poses are along the curves, which detections belong to which curve, and to which cone."""
+"""Association in a batch: poses along the curves, detections on curves, and detections of cones."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -19,46 +19,50 @@ from pathspace_graph.mapping.path import LATERAL_GAP, ROW_BESIDE, SIDES, in_fron
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import SAME_DIRECTION
+from pathspace_graph.spline.boundary import SAME_DIRECTION, ahead_of
 
-DENSITY_STEP: Final = 0.1  # step at which the density of detections along a curve is sampled (m)
-SEPARATION: Final = 0.6  # least distance of two cones along a curve, over `growth.merge_radius`
-BANDWIDTH: Final = 0.4  # of the Gaussian that smooths the density, over that least distance
-SHARP: Final = 0.6  # largest standard deviation of detections that say where a cone stands, m
-SHARP_SHARE: Final = 0.1  # share of so certain detections below which all of them say it
-MIN_SHARE: Final = 0.1  # least size of a cone's cluster as a share of the median cluster's
-MIN_SHARE_BESIDE: Final = 0.3  # `MIN_SHARE` of a cluster beside a curve, whose detections aren't used
-LINE_STEP: Final = 3.0  # distance along a line of the places that stand for its cones (m)
-ROW_CONES: Final = 4  # least number of cones of a curve, below which none is removed
-POSE_STEP: Final = 1.0  # at which the curve's point nearest to a pose is searched for, m along the curve
-DIRECTION_PENALTY: Final = 100.0  # distance added in quadrature where the curve runs against a heading, m
-FOOT_ROOM: Final = 1.5  # about its place in which the foot point of a cone is searched, m along the curve
-PASS_STRETCH: Final = 5.0  # most distance along the curve from a cone to the poses that pass it, m
-POSE_ROOM: Final = 2.0  # by which two poses may be farther apart along an open curve than was driven, m
-FOLD_COSINE: Final = 0.5  # a row of cones folds back where the cosine of its turn is less than minus this
-FOLD_DISTANCE: Final = 1.5  # from its nearer neighbour (m), below which a cone at such a turn is a duplicate
+DENSITY_STEP: Final = 0.1  # step of the sampled density of detections along a curve (m)
+SEPARATION: Final = 0.6  # least distance of two cones along a curve, relative to `growth.merge_radius`
+BANDWIDTH: Final = 0.4  # of the Gaussian that smooths the density, relative to that least distance
+SHARP: Final = 0.6  # largest standard deviation of detections that place a cone (m)
+SHARP_SHARE: Final = 0.1  # share of such detections below which all detections place cones
+MIN_SHARE: Final = 0.1  # least size of a cone's cluster, relative to the median cluster
+MIN_SHARE_BESIDE: Final = 0.3  # `MIN_SHARE` of a cluster of unused detections beside a curve
+LINE_STEP: Final = 3.0  # distance of the points that replace the cones of a line (m)
+ROW_CONES: Final = 4  # least number of cones of a curve; from fewer, none is removed
+POSE_STEP: Final = 1.0  # step of the curve in the search of the point nearest to a pose (m along the curve)
+DIRECTION_PENALTY: Final = 100.0  # distance added in quadrature where the curve runs against a heading (m)
+FOOT_ROOM: Final = 1.5  # room in which the foot point of a cone is searched (m along the curve)
+PASS_STRETCH: Final = 5.0  # largest distance of a cone from the poses that pass it (m along the curve)
+POSE_ROOM: Final = (
+    2.0  # largest excess of the distance of two poses along an open curve over the driven one (m)
+)
+FOLD_COSINE: Final = 0.5  # a row folds back where the cosine of its turn is below minus this
+FOLD_DISTANCE: Final = (
+    1.5  # distance from its nearer neighbour below which a cone at a fold is a duplicate (m)
+)
 
 
 # --- poses along the curves ------------------------------------------------------------------------------
 
 
 def add_drive(state: State, poses: Array, calibration: Array) -> None:
-    """Add the poses (P, 3) of all cycles to a state that has its curves already."""
+    """Add the poses (P, 3) of all cycles to a state that already has its curves."""
     insert_drive(state.variables, calibration, poses)
     locate_poses(state)
 
 
 def insert_drive(variables: Variables, calibration: Array, poses: Array) -> None:
-    """Make the calibration, (2,) or (7,), and the poses (P, 3) of a whole log variables."""
+    """Insert the calibration, (2,) or (7,), and the poses (P, 3) of a whole log as variables."""
     variables.insert_calibrations(calibration)
     variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
 
 
 def locate_poses(state: State) -> None:
-    """Set `pose_u`: the parameter of each curve's nearest point that runs in the direction of each pose.
+    """Set `pose_u`, the parameter of the nearest point of each curve in the direction of each pose.
 
-    On a closed curve it goes on from lap to lap. No pose is beside a stretch that an open curve has drifted
-    over.
+    It increases from lap to lap on a closed curve. On an open curve, which may have drifted over itself, it
+    follows the driven path.
     """
     poses = state.poses
     for label, boundary in state.boundaries.items():
@@ -79,7 +83,7 @@ def locate_poses(state: State) -> None:
 
 
 def _from_lap_to_lap(u: Array, length: float, drives: Drives) -> Array:
-    """Return parameters (P,) that go on from lap to lap, and from drive to drive by some lap more."""
+    """Unwrap parameters (P,) to increase from lap to lap, and from drive to drive by whole laps."""
     parts, last = list[Array](), -np.inf
     for part in drives.parts(len(u)):
         own = np.unwrap(u[part], period=length)
@@ -91,9 +95,9 @@ def _from_lap_to_lap(u: Array, length: float, drives: Drives) -> Array:
 
 
 def _along(square: Array, steps: Array) -> IntArray:
-    """Return the samples (P,) beside which the poses are, of least total squared distance (P, n).
+    """Choose the samples (P,) beside the poses with the least total squared distance (P, n).
 
-    From a pose to the next, the sample changes by no more than the next of `steps` (P - 1,).
+    From pose k to the next, the sample changes by at most `steps[k]` (P - 1,). Dynamic programming.
     """
     total, reach = square.copy(), np.ceil(steps).astype(np.intp)
     for k in range(1, len(total)):
@@ -108,7 +112,7 @@ def _along(square: Array, steps: Array) -> IntArray:
 
 
 def headings(poses: Array) -> Array:
-    """Return the unit vectors (m, 2) of the headings of poses (m, 3)."""
+    """Unit vectors (m, 2) of the headings of poses (m, 3)."""
     return np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
 
 
@@ -118,12 +122,12 @@ def headings(poses: Array) -> Array:
 def associate(
     state: State, detections: DetectionTable, settings: MapperSettings, gate: float, strict: bool
 ) -> None:
-    """Associate every detection anew: it is used where it lies within `gate` sigmas of its curve.
+    """Associate all detections again; a detection within `gate` sigmas of its curve is used.
 
-    It is searched for on the stretch of the curve that its pose sees. Only if the curves are about where they
-    belong (`strict`), one that fits nowhere there is searched for on the whole of a closed curve, since the
-    sensor sees across the infield, and one of unknown colour goes to the curve that it fits better. An open
-    curve may have drifted against itself by more than the gate.
+    It is searched on the stretch of the curve that its pose sees. Only when the curves are about right
+    (`strict`), a detection without a match there is searched on the whole of a closed curve, since the sensor
+    sees across the infield, and a detection of unknown colour goes to the curve that fits better. An open
+    curve may have drifted from itself by more than the gate.
     """
     boundary_of, u = np.full(len(detections), UNKNOWN), detections.u.copy()
     for whole in (False, True) if strict else (False,):
@@ -151,9 +155,9 @@ def _misfit(
     rows: IntArray,
     whole: bool,
 ) -> tuple[Array, Array]:
-    """Return how far each of the rows (m,) is from a curve, in sigmas (m,), and its foot point u (m,).
+    """Return the distances (m,) of rows (m,) from a curve, in sigmas, and the foot points u (m,).
 
-    The distance is infinite where the detection can't belong to the curve. `whole` searches the whole curve.
+    The distance is infinite if the detection cannot belong to the curve. `whole` searches the whole curve.
     """
     boundary, control_points = state.boundaries[label], state.control_points(label)
     poses = state.variables.poses_at(detections.cycle[rows])
@@ -163,11 +167,11 @@ def _misfit(
     else:
         in_view = _in_view(state, detections.cycle[rows], label, settings)
         begin = boundary.find(control_points, points, *in_view).u
-        foot = boundary.refine(control_points, points, begin)  # it may lie somewhat beyond
+        foot = boundary.refine(control_points, points, begin)  # the foot point may lie slightly beyond
     sigma_model = settings.spline.sigma_model
     sigma = sigma_across(foot.normal_unit, detections.covariance[rows], poses, sigma_model)
     possible = foot.interior & (np.abs(foot.distance) < settings.gate.rough)
-    if boundary.periodic and not whole:  # it belongs to the nearest stretch, which another pass may be beside
+    if boundary.periodic and not whole:  # drop a detection if another stretch of the curve is nearer
         room = settings.growth.merge_radius
         far = np.flatnonzero(possible & (np.abs(foot.distance) >= room))
         nearest = boundary.find_anywhere(control_points, points[far])
@@ -177,7 +181,7 @@ def _misfit(
 
 
 def _in_view(state: State, cycles: IntArray, label: int, settings: MapperSettings) -> tuple[Array, Array]:
-    """Return where on a curve begin and end the stretches (m,) that the poses of cycles (m,) see."""
+    """Return the limits of the stretches (m,) of a curve that the poses of cycles (m,) see."""
     boundary, u = state.boundaries[label], state.pose_u[label][cycles]
     ends = (-np.inf, np.inf) if boundary.periodic else (boundary.tables.low, boundary.tables.high)
     return np.clip(u - settings.gate.view_behind, *ends), np.clip(u + settings.gate.view_ahead, *ends)
@@ -188,29 +192,29 @@ def _in_view(state: State, cycles: IntArray, label: int, settings: MapperSetting
 
 @dataclass(frozen=True, eq=False)
 class Cones:
-    """Cones of a boundary in the order of travel."""
+    """Cones of a boundary in driving order."""
 
-    points: Array  # weighted means (k, 2) of the cones' detections in m, map frame
-    u: Array  # parameters (k,) along the curve or path (m)
-    count: IntArray  # numbers (k,) of detections
+    points: Array  # (k, 2) weighted means of the detections in m, map frame
+    u: Array  # (k,) parameters along the curve or path (m)
+    count: IntArray  # (k,) numbers of detections
 
     def where(self, chosen: BoolArray | IntArray) -> "Cones":
-        """Return the chosen cones, in the order in which they are chosen."""
+        """Select cones, in the given order if by index."""
         return Cones(self.points[chosen], self.u[chosen], self.count[chosen])
 
     def merged(self, other: "Cones") -> "Cones":
-        """Return the cones of both, ordered by parameter."""
+        """Merge with other cones, ordered by parameter."""
         u = np.append(self.u, other.u)
         both = Cones(np.concatenate([self.points, other.points]), u, np.append(self.count, other.count))
         return both.where(np.argsort(u, kind="stable"))
 
 
 def cones_of_curve(state: State, detections: DetectionTable, label: int, settings: MapperSettings) -> Cones:
-    """Return the cones of a boundary whose curve the state has.
+    """Find the cones of a boundary that has a curve.
 
-    A cone that is often detected beside the curve, but too far from it to be used, belongs to it as well: the
-    curve cuts a corner there. Those of a closed curve are in the order in which the vehicle passed them. A
-    line has no cones: the means of its detections about equally distant places stand for them.
+    A cone that is often detected beside the curve, but too far for its gate, counts as well: the curve cuts a
+    corner there. The cones of a closed curve are in the order in which the vehicle passed them. A line has no
+    cones; means of its detections around equally distant points replace them.
     """
     boundary, begin = state.boundaries[label], first_parameter(state, label)
     rows = np.flatnonzero(detections.label == label)
@@ -224,28 +228,24 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     beside[~used], on_curve[~used], u[~used] = _beside(state, points[~used], cycles[~used], label, settings)
     u = np.mod(u - begin, boundary.length) if boundary.periodic else u - begin
 
+    def along(chosen: BoolArray | IntArray) -> tuple[Array, Array, Array, float, bool, MapperSettings]:
+        return points[chosen], u[chosen], covariances[chosen], boundary.length, boundary.periodic, settings
+
     if label in settings.lines:
-        on_line = points[on_curve], u[on_curve], covariances[on_curve]
-        return points_along(*on_line, boundary.length, boundary.periodic, settings)
-
-    def clustered(chosen: BoolArray | IntArray) -> Cones:
-        along = points[chosen], u[chosen], covariances[chosen]
-        return cluster(*along, boundary.length, boundary.periodic, settings)
-
-    cones = clustered(on_curve)
+        return points_along(*along(on_curve))
+    cones = cluster(*along(on_curve))
     if len(cones.u) == 0:
         return cones
     others = np.flatnonzero(beside & ~on_curve)
     near = nearest_within(points[others], cones.points, settings.growth.merge_radius)[1]
-    off_curve = clustered(others[~near])
+    off_curve = cluster(*along(others[~near]))
     cones = cones.merged(off_curve.where(off_curve.count >= MIN_SHARE_BESIDE * np.median(cones.count)))
     if boundary.periodic:
         longest = state.drives.longest(len(state.poses))
         poses, pose_u = state.poses[longest], state.pose_u[label][longest]
         lap = pose_u > pose_u[-1] - boundary.length  # the last one
-        apart = np.mod(cones.u[:, None] + begin - pose_u[lap], boundary.length)
-        own = np.minimum(apart, boundary.length - apart) < PASS_STRETCH
-        cones = along_drive(cones, poses[lap], own, label)
+        apart = ahead_of(pose_u[lap], cones.u[:, None] + begin, boundary.length)
+        cones = along_drive(cones, poses[lap], np.abs(apart) < PASS_STRETCH, label)
     if len(detections.drives) > 1:
         cones = cones.where(seen_by_most(state, label, cones, points, cycles, settings))
     return without_folds(cones, boundary.periodic)
@@ -254,19 +254,17 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
 def seen_by_most(
     state: State, label: int, cones: Cones, points: Array, cycles: IntArray, settings: MapperSettings
 ) -> BoolArray:
-    """Return (k,) whether at least half of the drives that passed a cone have detected it.
+    """Whether at least half of the drives that passed a cone (k,) have detected it.
 
-    What stands is seen by all. The detections (m, 2) of the boundary, map frame, are of cycles (m,).
+    points (m, 2) are the detections of the boundary, map frame, made in cycles (m,).
     """
     u = first_parameter(state, label) + cones.u
     boundary, drive, growth = state.boundaries[label], state.drives.of(cycles), settings.growth
     seen, passed = np.zeros(len(u)), np.zeros(len(u))
     for d, part in enumerate(state.drives.parts(len(state.poses))):
-        apart = np.abs(u[:, None] - state.pose_u[label][part])
-        if boundary.periodic:
-            apart = np.mod(apart, boundary.length)
-            apart = np.minimum(apart, boundary.length - apart)
-        passes = apart.min(axis=1) < PASS_STRETCH
+        pose_u = state.pose_u[label][part]
+        apart = ahead_of(pose_u, u[:, None], boundary.length) if boundary.periodic else u[:, None] - pose_u
+        passes = np.abs(apart).min(axis=1) < PASS_STRETCH
         own, radius = KDTree(points[drive == d]), growth.merge_radius
         near = own.query_ball_point(cones.points, radius, return_length=True)
         passed += passes
@@ -275,23 +273,23 @@ def seen_by_most(
 
 
 def first_parameter(state: State, label: int) -> float:
-    """Return the parameter of a curve from which those of its cones are counted."""
+    """Parameter of a curve at which the parameters of its cones begin."""
     boundary = state.boundaries[label]
     return float(state.pose_u[label][0]) if boundary.periodic else boundary.tables.low
 
 
 def feet_of_cones(state: State, cones: Cones, label: int) -> FootPoints:
-    """Return the foot points of a boundary's cones on its curve, near their places along it."""
+    """Foot points of a boundary's cones on its curve, near their places along it."""
     boundary, u = state.boundaries[label], first_parameter(state, label) + cones.u
     return boundary.find(state.control_points(label), cones.points, u - FOOT_ROOM, u + FOOT_ROOM)
 
 
 def along_drive(cones: Cones, lap: Array, own: BoolArray, label: int) -> Cones:
-    """Return the cones of the row nearest to the poses (l, 3) of a lap, in the order in which these pass it.
+    """Select the cones of the row nearest to the poses (l, 3) of a lap, in the order in which these pass it.
 
-    `own` (k, l) are the poses beside each cone's own stretch of the curve: where one row bounds two lanes,
-    those of the other lane may be nearer. What stands behind the row belongs to another stretch, or is
-    smeared between two rows by far detections.
+    `own` (k, l) marks the poses beside each cone's own stretch of the curve: if one row bounds two lanes, the
+    poses of the other lane may be nearer. A cone behind the row belongs to another stretch, or is smeared
+    between two rows by far detections.
     """
     square = ((cones.points[:, None] - lap[:, :2]) ** 2).sum(axis=2)
     nearest = np.add(square, DIRECTION_PENALTY**2, out=square, where=~own).argmin(axis=1)
@@ -305,7 +303,7 @@ def along_drive(cones: Cones, lap: Array, own: BoolArray, label: int) -> Cones:
 def _beside(
     state: State, points: Array, cycles: IntArray, label: int, settings: MapperSettings
 ) -> tuple[BoolArray, BoolArray, Array]:
-    """Return which points (m, 2) lie beside a curve, which about its end, and their foot points u (m,)."""
+    """Return whether points (m, 2) lie beside a curve, whether around its end, and foot points u (m,)."""
     boundary, control_points = state.boundaries[label], state.control_points(label)
     if boundary.periodic:
         foot = boundary.find_anywhere(control_points, points)
@@ -317,7 +315,7 @@ def _beside(
 
 
 def without_folds(cones: Cones, periodic: bool) -> Cones:
-    """Return the cones without duplicates, at which their row folds back on itself over a short distance."""
+    """Remove duplicate cones, at which the row folds back on itself over a short distance."""
     points = cones.points
     if len(points) < ROW_CONES:
         return cones
@@ -336,11 +334,11 @@ def without_folds(cones: Cones, periodic: bool) -> Cones:
 def cluster(
     points: Array, u: Array, covariances: Array, length: float, periodic: bool, settings: MapperSettings
 ) -> Cones:
-    """Return a cone at each peak of the density of detections (m, 2) along a curve or a path.
+    """Place a cone at each peak of the density of detections (m, 2) along a curve or a path.
 
-    u (m,) in [0, length] are their parameters (m); the inverse traces of their covariances (m, 2, 2), map
-    frame, weigh them. A cone has at least `growth.sightings` detections within the merge radius of its peak,
-    and stands where they together say: what is smeared along one ray counts across it.
+    u (m,) in [0, length] are their parameters (m). Their weights are the inverse traces of their covariances
+    (m, 2, 2), map frame. A cone has at least `growth.sightings` detections within the merge radius of its
+    peak. It stands at their mean, weighted by the inverse covariances.
     """
     radius, weight = settings.growth.merge_radius, 1.0 / np.trace(covariances, axis1=1, axis2=2)
     peaks = _peaks(u, weight, length, periodic, SEPARATION * radius)
@@ -350,7 +348,7 @@ def cluster(
 def points_along(
     points: Array, u: Array, covariances: Array, length: float, periodic: bool, settings: MapperSettings
 ) -> Cones:
-    """Return the means of detections (m, 2) of a line about places that are `LINE_STEP` apart."""
+    """Means of detections (m, 2) of a line around points that are `LINE_STEP` apart."""
     count = max(int(length / LINE_STEP), 1)
     places = length * (np.arange(count) + 0.5) / count
     return _about(places, 0.5 * length / count, points, u, covariances, length, periodic, settings)
@@ -366,7 +364,7 @@ def _about(
     periodic: bool,
     settings: MapperSettings,
 ) -> Cones:
-    """Return the weighted means of detections (m, 2) within a radius (m) of peaks (k,) along a curve."""
+    """Weighted means of detections (m, 2) within a radius (m) of peaks (k,) along a curve."""
     if len(peaks) == 0:
         return Cones(np.zeros((0, 2)), peaks, np.zeros(0, np.intp))
     after = peaks.searchsorted(u)
@@ -387,7 +385,7 @@ def _about(
 
 
 def _peaks(u: Array, weight: Array, length: float, periodic: bool, apart: float) -> Array:
-    """Return the parameters (k,) of the smoothed density's maxima, which are `apart` (m) at least."""
+    """Parameters (k,) of the maxima of the smoothed density, at least `apart` (m) from each other."""
     bins = max(int(np.ceil(length / DENSITY_STEP)), 1)
     step = length / bins
     density = np.bincount((u / step).astype(np.intp).clip(0, bins - 1), weight, bins)

@@ -1,4 +1,4 @@
-"""The batch's problem as GTSAM's nonlinear factors, for whoever wants to go on with them."""
+"""Export of the batch's problem as GTSAM's nonlinear factors."""
 
 from collections.abc import Iterator, MutableSequence
 from dataclasses import replace
@@ -26,17 +26,20 @@ from pathspace_graph.spline.boundary import Boundary
 
 from .system import BatchSystem, CurveGauge, Evaluation
 
-SEARCH_ROOM: Final = 4.0  # distance from its foot points in which a factor searches them (m along the curve)
-SEARCH_HALVINGS: Final = 6  # most halvings of the room while another foot point in it is nearer, as in a bend
-SAME_FOOT: Final = 1e-3  # distance below which two foot points are the same (m along the curve)
+SEARCH_ROOM: Final = 4.0  # room around foot points in which a factor searches them (m along the curve)
+SEARCH_HALVINGS: Final = (
+    6  # largest number of halvings of the room to exclude nearer foot points, as in bends
+)
+SAME_FOOT: Final = 1e-3  # largest distance of equal foot points (m along the curve)
 
 
 def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
-    """Return every factor of the problem, on the keys of `graph.variables`.
+    """Build every factor of the problem, on the keys of `graph.variables`.
 
-    A graph of plain least squares, with the associations of `at` and the sigmas across the curve over the
-    roots of their robust weights. Each control point is anchored where it is. At an optimum its linearization
-    is that of the optimization; its error isn't the robust cost. SettingsError for several drives.
+    It is a graph of plain least squares, with the associations of `at`. Sigmas across the curve are divided
+    by the roots of their robust weights, and each control point is anchored at its position. At an optimum
+    the graph has the linearization of the optimization, but its error is not the robust cost. SettingsError
+    for several drives.
     """
     if len(at.state.drives) > 1:
         raise SettingsError(f"graph: expected the batch of one drive, found {len(at.state.drives)} drives")
@@ -50,7 +53,7 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
 
 
 def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield all factors that hold no control point: odometry, first pose and the priors of calibrations."""
+    """Yield all factors without control points: odometry, revisits, first pose and priors of calibrations."""
     for k, interval in enumerate(system.chain.odometry.intervals):
         yield odometry_factor(k, interval)
     for one in system.revisits:
@@ -76,7 +79,7 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
 
 
 def _priors(gauge: CurveGauge, state: State) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield the weak priors of a curve's control points: where along it, how smooth, and anchors."""
+    """Yield the weak priors of a curve's control points: slide along it, smoothness, and anchors."""
     label, boundary = gauge.label, state.boundaries[gauge.label]
     anchor = gtsam.noiseModel.Isotropic.Sigma(POINT, boundary.gauge.sigma_anchor)
     for j, (key, point) in enumerate(zip(gauge.keys.tolist(), state.control_points(label), strict=True)):
@@ -88,10 +91,7 @@ def _priors(gauge: CurveGauge, state: State) -> Iterator[gtsam.NonlinearFactor]:
 
 
 def factor_beside(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
-    """Return the factor that holds control point j of a curve beside its pose.
-
-    GTSAM's tangents of a pose are in its own frame.
-    """
+    """Build the factor that keeps control point j of a curve beside its pose."""
     point_key, cycle = int(gauge.keys[j]), int(gauge.cycle[j])
     alone = replace(gauge, ahead=gauge.ahead[j : j + 1])
 
@@ -99,7 +99,7 @@ def factor_beside(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
         pose = values.atPose2(pose_key(cycle))
         point = np.array(values.atPoint2(point_key))
         residual, by_point, by_pose = alone.terms(point[None], pose_array(pose)[None])
-        if H is not None:
+        if H is not None:  # GTSAM's tangents of a pose are in its own frame
             by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
             fill(H, [by_point, by_pose])
         return residual
@@ -108,7 +108,7 @@ def factor_beside(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
 
 
 def _across(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:
-    """Return a factor for each cycle, of its used detections on a boundary."""
+    """Build a factor for each cycle, with its used detections on a boundary."""
     boundary, variables = at.state.boundaries[label], at.state.variables
     chosen, measured = _measured(system, at, at.across, label)
     u, points = at.u[chosen], system.detections.points_map(at.across.rows[chosen], variables)
@@ -117,7 +117,7 @@ def _across(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.Custo
 
 
 def _along(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:
-    """Return a factor for each cycle, of its used detections at stations of a boundary."""
+    """Build a factor for each cycle, with its used detections at stations of a boundary."""
     if system.matches is None:
         return []
     chosen, measured = _measured(system, at, at.along, label)
@@ -129,7 +129,7 @@ def _along(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.Custom
 def _measured(
     system: BatchSystem, at: Evaluation, seen: DetectionRows, label: int
 ) -> tuple[BoolArray, dict[str, Any]]:
-    """Return which detections (m,) of a boundary have any weight, and what factors need of these."""
+    """Return whether detections (m,) of a boundary have a weight, and the arguments of their factors."""
     detections, scale = system.detections, seen.scale(system.kernel.weights(seen.whitened))
     chosen = (detections.boundary[seen.rows] == label) & (scale > 0.0)
     rows = seen.rows[chosen]
@@ -146,7 +146,7 @@ def _measured(
 
 
 def _room(boundary: Boundary, control_points: Array, points: Array, u: Array) -> Array:
-    """Return the room (m,) about u in which the nearest foot point of each point (m, 2) is that at u."""
+    """Room (m,) around u in which the foot point at u is the nearest one to each point (m, 2)."""
     room = np.full(len(u), SEARCH_ROOM)
     for _ in range(SEARCH_HALVINGS):
         nearest = boundary.find(control_points, points, u - room, u + room).u

@@ -1,8 +1,8 @@
 """Several drives of one track as one problem: one set of curves, and a chain of poses for each drive.
 
-The cycles are counted on from drive to drive, without odometry between them. Each drive has a calibration of
-its own; drives of one vehicle share the sensor's. What holds the drives together is what both saw: curves,
-their stations, and poses of a later drive in the frame of an earlier one.
+Cycles are numbered consecutively over all drives, without odometry between drives. Each drive has its own
+calibration; drives of one vehicle share the sensor's. Common observations connect the drives: curves, their
+stations, and poses of a later drive in the frame of an earlier one.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import compose, inverse, move_points, path_lengths
 from pathspace_graph.factors.sensor import SENSOR_SIZE
@@ -21,8 +21,8 @@ from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, are_poses, pose_keys
-from pathspace_graph.mapping.constellation import NEARBY, find_return, revisit_of
-from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
+from pathspace_graph.mapping.constellation import NEARBY, find_return, revisit_of, seen_in
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -32,17 +32,17 @@ from .objections import disagreement
 from .simplification import boundary_of
 from .system import BatchSystem
 
-REVISIT_INTERVAL: Final = 20.0  # distance of the places where a drive is laid on earlier ones (m of its way)
+REVISIT_INTERVAL: Final = 20.0  # distance of the places at which a drive is laid on earlier ones (m driven)
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedDrive:
-    """A drive that was solved alone, and where it is on the map of all."""
+    """A drive that was solved alone, and its place on the common map."""
 
     name: str
     alone: BatchResult
     motion: Array  # (3,) from the frame of the drive to that of the map
-    vehicle: str = ""  # name of the vehicle, if the log says it
+    vehicle: str = ""  # name of the vehicle, if the log has it
 
     @property
     def chain(self) -> LogOdometry:
@@ -50,22 +50,22 @@ class PlacedDrive:
 
     @property
     def state(self) -> State:
-        """Return the optimum of the drive alone, in its own frame."""
+        """Optimum of the drive alone, in its own frame."""
         return self.alone.optimum.state
 
     @property
     def settings(self) -> MapperSettings:
-        """Return the settings with the drive's own priors of its calibrations."""
+        """Settings with the drive's own priors of its calibrations."""
         return self.alone.system.settings
 
     @property
     def poses(self) -> Array:
-        """Return the poses (P, 3) of the drive alone, in the frame of the map."""
+        """Poses (P, 3) of the drive alone, in the frame of the map."""
         return compose(self.motion, self.state.poses)
 
 
 def drives_of(placed: Sequence[PlacedDrive]) -> Drives:
-    """Return where each drive begins, and its sensor: one for all drives of a vehicle with a name."""
+    """Lay out drives and sensors; the drives of a named vehicle share one sensor."""
     first = np.cumsum([0, *(len(one.chain) for one in placed[:-1])]).tolist()
     names = [one.vehicle or f"/{k}" for k, one in enumerate(placed)]
     known = list(dict.fromkeys(names))
@@ -78,20 +78,23 @@ class JointSystem(BatchSystem):
     def __init__(self, placed: Sequence[PlacedDrive]) -> None:
         self.placed, self.drives = tuple(placed), drives_of(placed)
         detections = DetectionTable.of_drives([one.alone.system.detections for one in placed], self.drives)
-        begins = zip(placed, self.drives.first, strict=True)
-        own = [later_by(one, begin) for drive, begin in begins for one in drive.alone.system.revisits]
+        own = [
+            replace(one, earlier=one.earlier + begin, later=one.later + begin)
+            for drive, begin in zip(placed, self.drives.first, strict=True)
+            for one in drive.alone.system.revisits
+        ]
         super().__init__(detections, placed[0].chain, placed[0].settings, own)
         self.chains = [one.chain for one in placed]  # the odometry of each drive
-        self.priors = [one.settings for one in placed]  # settings of each, for the priors of its calibrations
+        self.priors = [one.settings for one in placed]
 
-    def widen_priors_of(self, drive: int, settings: MapperSettings) -> None:
+    def widen_priors(self, drive: int, settings: MapperSettings) -> None:
         """Take the priors of a drive's calibrations from other settings."""
         sigma = np.array(settings.odometry.sigmas)
         self.priors[drive] = settings
         self.chains[drive] = replace(self.chains[drive], calibration_sigma=sigma)
 
     def drive_rows(self, state: State) -> list[Rows]:
-        """Return the rows of each drive's odometry and calibrations; only the first has a first pose."""
+        """Rows of odometry and calibrations of each drive; only the first has a prior of its first pose."""
         groups, variables = list[Rows](), state.variables
         calibrations = variables.calibration.reshape(-1, CALIBRATION_SIZE)
         for d, part in enumerate(self.drives.parts(len(state.poses))):
@@ -102,7 +105,7 @@ class JointSystem(BatchSystem):
         return groups + self._sensor_priors(state)
 
     def _sensor_priors(self, state: State) -> list[Rows]:
-        """Return the prior of each sensor, that of the first drive which has it."""
+        """Rows of the prior of each sensor, from its first drive."""
         groups, sensors = [], state.variables.sensor
         for number in range(len(sensors) // SENSOR_SIZE):
             prior = self.priors[self.drives.sensors.index(number)].calibration
@@ -113,25 +116,21 @@ class JointSystem(BatchSystem):
         return groups
 
     def disagreement_of(self, drive: int, state: State) -> str:
-        """Return that the poses of a drive are not those of its odometry; empty if they are."""
+        """Describe how the poses of a drive contradict its odometry; empty if they agree."""
         poses = state.poses[self.drives.parts(len(state.poses))[drive]]
         one = self.placed[drive]
         back = compose(one.state.poses[0], inverse(poses[0]))
         return disagreement(one.alone.system, compose(back, poses))
 
 
-def later_by(revisit: Revisit, cycles: int) -> Revisit:
-    return replace(revisit, earlier=revisit.earlier + cycles, later=revisit.later + cycles)
-
-
 def in_drive(rows: Rows, number: int, first_cycle: int) -> Rows:
-    """Return rows of a drive alone as those of a drive of several, by its number and first cycle."""
+    """Renumber rows of a drive alone, by its number and first cycle among several drives."""
     keys = rows.keys + np.where(are_poses(rows.keys), first_cycle, number)
     return replace(rows, keys=keys, owner=rows.owner + owners(np.array(first_cycle)))
 
 
 def joint_state(system: JointSystem, known: PlacedDrive) -> State:
-    """Return the curves of one of the drives, and the poses of all, where each of them is placed alone."""
+    """Build a state of the curves of one drive and the poses of all, each as placed alone."""
     state, placed, drives = State(drives=system.drives), system.placed, system.drives
     for label, spline in known.state.splines.items():
         curve = replace(spline, control_points=move_points(known.motion, spline.control_points))
@@ -150,13 +149,9 @@ def joint_state(system: JointSystem, known: PlacedDrive) -> State:
 
 
 def revisits_between(system: JointSystem, state: State) -> list[Revisit]:
-    """Return poses of each later drive in the frame of one of an earlier drive, by cones that both saw."""
+    """Return poses of each later drive in the frame of one of an earlier drive, by their common cones."""
     table, settings, found = system.detections.cones(system.settings.lines), system.settings, list[Revisit]()
     table.correct(state.variables.sensor)
-
-    def seen_in(cycles: IntArray) -> DetectionColumns:
-        return table.where(np.flatnonzero(table.in_cycles(cycles)))
-
     driven = path_lengths(state.poses)
     for part in system.drives.parts(len(driven))[1:]:
         before, due = float(driven[part.start]), REVISIT_INTERVAL
@@ -165,7 +160,7 @@ def revisits_between(system: JointSystem, state: State) -> list[Revisit]:
                 continue
             due = driven[newest] - before + REVISIT_INTERVAL
             poses = state.poses[: newest + 1]
-            laid = find_return(seen_in, poses, before, NEARBY, settings.growth)
+            laid = find_return(seen_in(table), poses, before, NEARBY, settings.growth)
             if laid is not None and laid[0].is_sure:
                 found.append(revisit_of(laid[0], poses, laid[1], newest))
     return found

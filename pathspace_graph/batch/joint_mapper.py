@@ -1,8 +1,7 @@
-"""The map of several logs: each drive is solved alone and placed on the map, then all are solved as one."""
+"""The map of several logs: each drive is solved alone and placed on the map, then all are solved together."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -11,41 +10,29 @@ from pathspace_graph.errors import SolveError, solving
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, path_lengths
 from pathspace_graph.io.log import Log
+from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.io.moved import moved
 from pathspace_graph.lengths import scaled
-from pathspace_graph.mapping.motion import with_inflated_priors
 from pathspace_graph.run import Stopwatch
 from pathspace_graph.scale import chosen_scale
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .joint import JointSystem, PlacedDrive, joint_state, revisits_between
-from .mapper import (
-    NAME,
-    BatchMapper,
-    BatchResult,
-    frame_of,
-    known_of,
-    map_covariance,
-    map_of,
-    records_of,
-    vehicle_of,
-)
-from .objections import unmapped
+from .mapper import BatchMapper, BatchResult, Found, frame_of, map_of, result_of, with_wider_priors
 from .optimizer import Optimizer
 from .placement import Driven, NotPlacedError, find_place
-from .simplification import simplified
 
 
 @dataclass(frozen=True, eq=False)
 class JointResult:
-    """The map of several drives, and what is known of each of them."""
+    """The map of several drives, and the result of each."""
 
     drives: dict[str, BatchResult]
-    """Each drive that is in the map, by name; all have one map, in the frame of the first."""
+    """Result of each drive in the map, by name; all have one map, in the frame of the first."""
     frames: dict[str, Array]
-    """Pose (3,) of each vehicle at the first stamp of its log, which is the origin of its own frame."""
+    """Pose (3,) of each vehicle at the first stamp of its log, the origin of its own frame."""
     left_out: dict[str, str]
-    """Why each other drive is not in the map, by name."""
+    """Reason for which each other drive is not in the map, by name."""
 
 
 def solve_together(
@@ -55,10 +42,10 @@ def solve_together(
     start: Start | None = None,
     on_round: Callable[[], None] | None = None,
 ) -> JointResult:
-    """Return one map of several logs by name, in the frame of the first log that is in it.
+    """Solve one map of several logs by name, in the frame of the first log that is in it.
 
-    `make` makes the mapper by which each log is solved alone. A log that can't be solved alone, or whose
-    drive fits nowhere on the map of the others, is left out. SolveError where none is left.
+    `make` makes the mapper that solves each log alone. A log that cannot be solved alone, or whose drive fits
+    nowhere on the map of the others, is left out. SolveError if none is left.
     """
     settings = known_settings(settings)
     settings = replace(settings, scale=chosen_scale(settings, next(iter(logs.values()))))
@@ -79,9 +66,9 @@ def join(
     vehicles: Mapping[str, str] | None = None,
     on_round: Callable[[], None] | None = None,
 ) -> JointResult:
-    """Return one map of drives that were solved alone, at one scale.
+    """Solve one map of drives that were solved alone, at one scale.
 
-    Drives of one vehicle, where its name is known, share the calibration of the sensor.
+    Drives of one vehicle, if its name is known, share the calibration of the sensor.
     """
     scale, watch = next(iter(alone.values())).scale, Stopwatch()
     with threadpool_limits(limits=1), solving("the joint batch"):
@@ -96,7 +83,7 @@ def join(
 def place_all(
     alone: Mapping[str, BatchResult], vehicles: Mapping[str, str]
 ) -> tuple[list[PlacedDrive], dict[str, str]]:
-    """Return the drives that lie on the map of the base, and why each other doesn't, by name."""
+    """Place drives on the map of the base; return them, and by name why others do not fit."""
     known = base_of(alone)
     motions, left_out = {known: np.zeros(3)}, dict[str, str]()
     for name, one in alone.items():
@@ -115,7 +102,7 @@ def place_all(
 
 
 def base_of(alone: Mapping[str, BatchResult]) -> str:
-    """Return the name of the drive with whose curves all begin: the first closed one, or else the longest."""
+    """Name of the drive whose curves are the start: the first closed one, or else the longest."""
     closed = (name for name, one in alone.items() if one.map.closed)
     return next(closed, max(alone, key=lambda name: float(path_lengths(alone[name].trajectory)[-1])))
 
@@ -125,7 +112,7 @@ def driven(result: BatchResult) -> Driven:
 
 
 class _Joint:
-    """The search for the optimum of all drives, from which those that contradict it are taken out."""
+    """Search for the optimum of all drives; drives that contradict it are left out."""
 
     def __init__(
         self, placed: Sequence[PlacedDrive], on_round: Callable[[], None] | None, watch: Stopwatch
@@ -134,89 +121,45 @@ class _Joint:
         self._on_round, self._watch = on_round, watch
 
     def solve(self) -> None:
-        """Search the optimum, and again without drives that contradict it."""
+        """Search the optimum, again without drives that contradict it."""
         base = base_of({one.name: one.alone for one in self.placed})
         self.system = JointSystem(self.placed)
         state = joint_state(self.system, next(one for one in self.placed if one.name == base))
         self.system.revisits += tuple(revisits_between(self.system, state))
-        self.optimizer = Optimizer(self.system, on_round=self._on_round)
-        self.at, self.convergence = self.optimizer.find(state)
-        wrong = self._contradicting()
+        optimizer = Optimizer(self.system, on_round=self._on_round)
+        found = Found(optimizer, *optimizer.find(state))
+        why = {one.name: self.system.disagreement_of(d, found.at.state) for d, one in enumerate(self.placed)}
+        wrong = {name: reason for name, reason in why.items() if reason}
         if wrong and len(wrong) < len(self.placed):
             self.left_out |= wrong
             self.placed = [one for one in self.placed if one.name not in wrong]
             self.solve()
             return
-        self._widen_priors()
+        self.found, self.known = with_wider_priors(found)
         self._watch.lap("optimum")
-
-    def _contradicting(self) -> dict[str, str]:
-        """Return why drives don't agree with the optimum, by name."""
-        found = {one.name: self.system.disagreement_of(d, self.at.state) for d, one in enumerate(self.placed)}
-        return {name: why for name, why in found.items() if why}
-
-    def _widen_priors(self) -> None:
-        """Search the optimum again while it contradicts the prior of a calibration."""
-        self.marginal, state, widened = known_of(self.system, self.at), self.at.state, False
-        for d, settings in enumerate(self.system.priors):
-            keys = state.calibration_keys(d)
-            variance = np.diag(self.marginal.covariance(keys))
-            wider = with_inflated_priors(state.variables.of(keys), variance, settings)
-            if wider != settings:
-                self.system.widen_priors_of(d, wider)
-                widened = True
-        if widened:
-            self.at, self.convergence = self.optimizer.find(state)
-            self._widen_priors()
-
-    # --- the result --------------------------------------------------------------------------------------
 
     def result(self, scale: float) -> JointResult:
         """Return the result in metres of the logs, whose scene has a scale."""
-        system, state, watch = self.system, self.at.state, self._watch
-        settings = system.settings
-        joint = map_covariance(state, self.marginal, settings)
-        few = simplified(state, system.detections, settings)
-        joint = few.change @ joint @ few.change.T
-        watch.lap("simplify")
-        track = replace(map_of(few, joint, settings), points=self._orange())
+        track = map_of(self.found, self.known, self._orange(), self._watch)
         drives, frames = dict[str, BatchResult](), dict[str, Array]()
-        for d, (one, part) in enumerate(zip(self.placed, system.drives.parts(len(state.poses)), strict=True)):
-            poses, seconds = state.poses[part], sum(watch.laps.values()) / len(self.placed)
-            records, laps = records_of(few, one.chain, seconds, d)
-            own = few.detections.of_drive(d)
-            own = replace(own, cycle=own.cycle - part.start)
-            vehicle = vehicle_of(state, self.marginal, settings, d)
-            drive = BatchResult(
-                estimator=NAME,
+        for d, one in enumerate(self.placed):
+            drive = result_of(
+                self.found,
+                self.known,
+                track,
                 settings=one.alone.settings,
-                map=track,
-                scatter=few.scatter,
-                trajectory_t=one.chain.stamps,
-                trajectory=poses.copy(),
-                cycles=records,
-                laps=laps,
-                converged=self.convergence.converged,
-                cost=self.convergence.cost,
-                convergence=self.convergence,
-                map_covariance=joint,
-                calibration=vehicle.calibration,
                 noise=one.alone.noise,
-                vehicle=vehicle,
-                online=None,
-                seconds=watch.laps,
-                system=system,
-                optimum=self.at,
-                objection=unmapped(own, poses),
+                chain=one.chain,
+                seconds=self._watch.laps,
                 drive=d,
             )
             drives[one.name] = scaled(drive, scale)
-            frames[one.name] = frame_of(one.chain, poses) * [scale, scale, 1.0]
+            frames[one.name] = frame_of(one.chain, drive.trajectory) * [scale, scale, 1.0]
         return JointResult(drives, frames, {})
 
-    def _orange(self) -> dict[int, Any]:
+    def _orange(self) -> dict[int, PointBoundary]:
         """Return the orange cones of the first drive that has some of a label, by label."""
-        found: dict[int, Any] = {}
+        found = dict[int, PointBoundary]()
         for one in self.placed:
             own = moved(scaled(one.alone.map, 1.0 / one.alone.scale), one.motion).points
             found = {**own, **found}

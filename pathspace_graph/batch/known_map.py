@@ -1,4 +1,4 @@
-"""A known map: the prior of the curves where a drive begins on a map that was there before it."""
+"""A known map: the prior of the curves for a drive on an existing map."""
 
 from dataclasses import dataclass, replace
 from typing import Final, Self
@@ -22,28 +22,29 @@ from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
 from .simplification import fit_through
 
-KEPT: Final = 1e-3  # standard deviation of the control points of a map that is kept as it is (m)
-PLACE_ROOM, PLACE_LEAST = 0.02, 4.0  # of an open curve's length, and of its own (m), in which a cone lies
-INSIDE: Final = 1e-6  # least distance of a cone from the end of its curve, which is the seam if closed (m)
-FLOOR: Final = 0.01  # standard deviation added to those of any other map (m), which makes it regular
+KEPT: Final = 1e-3  # standard deviation of the control points of a fixed map (m)
+PLACE_ROOM: Final = 0.02  # room in which the foot point of a cone is searched, by the length of an open curve
+PLACE_LEAST: Final = 4.0  # added to that room (m)
+INSIDE: Final = 1e-6  # least distance of a cone from the end of its curve, the seam if closed (m)
+FLOOR: Final = 0.01  # standard deviation added in any other map, which makes its covariance regular (m)
 
 
 @dataclass(frozen=True, eq=False)
 class KnownMap:
-    """Both curves of a map that was there before the drive, and the Gaussian of their control points."""
+    """Both curves of a map from before the drive, and the Gaussian of their control points."""
 
     splines: dict[int, BSpline]
     confirmed: dict[int, float]  # parameter up to which each curve is confirmed (m)
     covariance: Array  # (n, n) of the distinct control points, left first, in m^2
     cones: dict[int, Array]  # (k, 2) cones of each curve: parameters, and sigmas along it (m)
-    kept: bool  # whether the map is held as it is
+    kept: bool  # whether the map is fixed
 
     @classmethod
     def of(cls, track: Map, keep: bool = False, lines: tuple[int, ...] = ()) -> Self:
-        """Return the known map of a map with both curves; `keep` holds it as it is.
+        """Build the known map from a map with both curves; `keep` fixes it.
 
-        The cones of boundaries of which the sensor sees `lines` tell nothing.
-        SettingsError is raised for a map without both curves or without covariances.
+        The cones of boundaries that are `lines` for the sensor are dropped. SettingsError for a map without
+        both curves or without covariances.
         """
         boundaries = track.curves("a known map")
         covariance = track.covariance_of(*boundaries)
@@ -63,7 +64,7 @@ class KnownMap:
 
     @property
     def ends(self) -> dict[int, float]:
-        """Return from where on each curve grows (m), infinity where all of it is confirmed: it is whole."""
+        """Return the parameter from which each curve grows (m), infinite if all of it is confirmed."""
         return {
             label: np.inf if self.kept or self.confirmed[label] >= spline.domain[1] else self.confirmed[label]
             for label, spline in self.splines.items()
@@ -74,7 +75,7 @@ class KnownMap:
         return any(spline.periodic for spline in self.splines.values())
 
     def boundary(self, label: int, settings: MapperSettings, first: int = 0) -> Boundary:
-        """Return a curve as a boundary whose control points have keys from the number `first` on."""
+        """Convert a curve to a boundary; the keys of its control points begin at the number `first`."""
         spline = self.splines[label]
         own = replace(settings.spline, degree=spline.degree)
         boundary = Boundary(spline.knots, spline.periodic, own, settings.gauge, first)
@@ -85,7 +86,7 @@ class KnownMap:
         return boundary
 
     def smoother(self, settings: MapperSettings) -> CurveSmoother:
-        """Return the map alone, without a drive, as a search needs it."""
+        """Return a smoother with the map alone, without a drive, for a search."""
         smoother = CurveSmoother(settings)
         for label, spline in self.splines.items():
             points = spline.distinct_control_points
@@ -94,14 +95,14 @@ class KnownMap:
         return smoother
 
     def place_cones(self, track: CurveMap) -> None:
-        """Give a map whose curves are the known ones their cones; open ones need weak priors as they grow."""
+        """Hand the cones to a map with the known curves; open curves keep weak priors, since they grow."""
         places = {label: cones[:, 0] for label, cones in self.cones.items() if len(cones)}
         stations = {label: cones.T for label, cones in self.cones.items()}
         track.replaced_by({}, places, stations if len(places) == len(stations) else {}, self.closed)
 
     @property
     def constellation(self) -> Constellation | None:
-        """Return the cones in the map frame; None where their places are not known."""
+        """Cones in the map frame; None if a curve has none."""
         points, labels, sigmas = [], [], []
         for label, cones in self.cones.items():
             points.append(self.splines[label].evaluate(cones[:, 0]))
@@ -115,7 +116,7 @@ class KnownMap:
 def map_of_cones(
     left: Array, right: Array, closed: bool, sigma: float, settings: MapperSettings | None = None
 ) -> Map:
-    """Return the map through cones (n, 2) in driving order, known with a standard deviation `sigma` (m)."""
+    """Build a map through cones (n, 2) in driving order, known with a standard deviation `sigma` (m)."""
     settings, boundaries = known_settings(settings), dict[int, SplineBoundary]()
     for label, cones in zip(BOUNDARIES, (left, right), strict=True):
         spline = fit_through(cones, closed, settings, settings.batch.dense_share)
@@ -127,7 +128,7 @@ def map_of_cones(
 
 
 def _places(spline: BSpline, cones: Array) -> Array:
-    """Return the parameters (n,) of cones (n, 2), in driving order, on a curve that may cross itself."""
+    """Parameters (n,) of cones (n, 2), in driving order, on a curve that may cross itself."""
     low, high = spline.domain
     begin, end = np.full(len(cones), low), np.full(len(cones), high)
     if not spline.periodic:
@@ -140,7 +141,7 @@ def _places(spline: BSpline, cones: Array) -> Array:
 
 
 def _floating(spline: BSpline) -> tuple[BSpline, Array]:
-    """Return a curve with floating ends, and the change of its distinct control points."""
+    """Return the same curve with floating ends, and the change of its distinct control points."""
     if spline.periodic or spline.knots[0] < spline.knots[spline.degree]:
         return spline, np.eye(spline.size)
     floating = spline.unclamp()

@@ -1,11 +1,11 @@
-"""The batch of the open lap: what an online mapper goes on from after its loop has closed.
+"""The batch of the open lap, whose result replaces the online map after loop closure.
 
 Online, every measurement of the first lap is linearized while the map is still open, and the curves are
-sparse. Both turn the map by several tenths of a degree. Here the same measurements are solved again as a
-batch, on curves that meet the cones. The result is a marginal: what the poses that have left the window know
+sparse. Both rotate the map by several tenths of a degree. The batch solves the same measurements again, on
+curves that meet the cones. The result is a marginal: the information of the poses that have left the window
 about the simplified map, the calibration and the oldest pose of the window.
 
-The batch of a lap begins at odometry and the revisit that ended the lap, and that of a repair at a map.
+The batch of a lap starts from odometry and the revisit that ended the lap, a repair from a map.
 """
 
 import time
@@ -29,14 +29,14 @@ from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
 from .association import add_drive
-from .objections import speaks_against
+from .objections import evidence_against
 from .optimizer import Convergence, Effort, Optimizer
 from .simplification import boundary_of, map_block, own_settings, simplified
 from .start import start_odometry
 from .stations import StationMatches
 from .system import BatchSystem, Evaluation, curve_gauge
 
-FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, tolerance=10.0)  # so that it is in time
+FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, tolerance=10.0)  # limited, to finish in time
 FROM_ODOMETRY: Final = Effort(rounds=24, tolerance=10.0)
 
 
@@ -46,10 +46,10 @@ class ClosedMap:
 
     splines: dict[int, BSpline]  # closed curves by label, map frame
     poses: Array  # (P, 3) poses of all cycles, map frame
-    calibration: Array  # (2,) or (7,) calibration of the odometry, and of the sensor where it is estimated
+    calibration: Array  # (2,) or (7,) calibration of the odometry, and of the sensor if estimated
 
     def state(self, settings: MapperSettings) -> State:
-        """Return the map and the poses as a state to begin with."""
+        """Build the initial state from the map and the poses."""
         state = State()
         for label, spline in self.splines.items():
             state.add_boundary(label, *boundary_of(spline, settings))
@@ -59,41 +59,41 @@ class ClosedMap:
 
 @dataclass(frozen=True, eq=False)
 class OpenLap:
-    """Everything measured from the start to the closing cycle, and what to begin with."""
+    """All measurements from the start to the closing cycle, and the start of the batch."""
 
     settings: MapperSettings  # settings of the online mapper
     chain: LogOdometry  # odometry between all cycles
-    detections: DetectionTable  # detections of all cycles; their associations are found anew
-    first_kept: int  # the poses from this cycle on stay variables of the window
-    start: ClosedMap | Revisit  # a map, or the revisit that ended the lap, from which odometry begins
-    factors: tuple[Rows, ...] = ()  # of the user's factors on poses, at values of zero
+    detections: DetectionTable  # detections of all cycles, to associate again
+    first_kept: int  # first cycle whose pose stays a variable of the window
+    start: ClosedMap | Revisit  # a map, or the revisit that ended the lap, for a start from odometry
+    factors: tuple[Rows, ...] = ()  # the user's factors on poses, at values of zero
 
 
 @dataclass(frozen=True, eq=False)
 class LapMarginal:
-    """The batch's map on few knots, and what the poses before `first_kept` know about it.
+    """The batch's map on few knots, and the information of the poses before `first_kept` about it.
 
-    A Gaussian of [calibration | control points, left first | pose of `first_kept`].
+    It is a Gaussian of [calibration | control points, left first | pose of `first_kept`].
     """
 
     convergence: Convergence
     splines: dict[int, BSpline]  # simplified closed curves by label, map frame
     calibration: Array  # (2,) or (7,) calibration of odometry and sensor at the optimum
     poses: Array  # (P, 3) poses of all cycles of the lap, map frame
-    first_kept: int  # cycle before whose pose all measurements are in the marginal, and no later ones
+    first_kept: int  # cycle that ends the marginal: it has all measurements of earlier poses, and no others
     mean: Array  # (n,) mean of the marginal
     information: Array  # (n, n) its information, the inverse of its covariance
-    scatter: dict[int, Array]  # sigma (m,) of each boundary's control points that is its cones' scatter (m)
-    cones: dict[int, Array]  # parameters (k,) of each boundary's detected cones on its curve (m)
+    scatter: dict[int, Array]  # (m,) sigma of each boundary's control points by the scatter of its cones (m)
+    cones: dict[int, Array]  # (k,) parameters of each boundary's detected cones on its curve (m)
     stations: dict[int, Array]
-    """(2, k) parameters of cones that hold detections along each curve, and the sigmas of these cones along
-    it, given the curve (m); empty without stations."""
+    """(2, k) parameters of stations along each curve, and sigmas of the cones along it, given the curve (m);
+    empty without stations."""
     seconds: float  # wall time (s)
-    objection: str = ""  # what speaks against the map; empty where nothing does
+    objection: str = ""  # evidence against the map; empty if there is none
 
 
 def solve_lap(lap: OpenLap) -> LapMarginal:
-    """Return the marginal of an open lap at the optimum of its batch. It uses one thread."""
+    """Compute the marginal of an open lap at the optimum of its batch, in one thread."""
     begin = time.perf_counter()
     with threadpool_limits(limits=1):
         system, at, convergence = lap_optimum(lap)
@@ -115,12 +115,12 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             cones=scatter.places,
             stations=stations,
             seconds=time.perf_counter() - begin,
-            objection=speaks_against(system, at, few.splines, simple.detections),
+            objection=evidence_against(system, at, few.splines, simple.detections),
         )
 
 
 def lap_optimum(lap: OpenLap, effort: Effort | None = None) -> tuple[BatchSystem, Evaluation, Convergence]:
-    """Return the problem of a lap, its optimum on curves that meet the cones, and how it was found."""
+    """Return the problem of a lap, its optimum on curves that meet the cones, and the convergence."""
     start, settings = lap.start, own_settings(lap.settings)
     revisits = [start] if isinstance(start, Revisit) else []
     system = BatchSystem(lap.detections.copy(), lap.chain, settings, revisits, lap.factors)
@@ -136,10 +136,10 @@ def marginal_of(
 ) -> tuple[Array, Array, Array]:
     """Return information (n, n) and mean (n,) of [calibration | few control points | oldest kept pose].
 
-    The third is the covariance (d, d) of the dense control points. Only factors of poses before `first_kept`
-    are summed, linearized at the optimum, since the window has the others. `change` F maps the dense control
-    points to the few. So the covariance is `T Sigma T'` with `T = diag(I, F, I)`, where Sigma is the inverse
-    of the dense marginal's information.
+    The third result is the covariance (d, d) of the dense control points. The marginal has the factors of
+    poses before `first_kept`, linearized at the optimum; the window has the others. `change` F maps the dense
+    control points to the few. So the covariance is `T Sigma T'` with `T = diag(I, F, I)`, where Sigma is the
+    covariance of the dense marginal.
     """
     state, variables = at.state, at.state.variables
     oldest = pose_keys(np.array([first_kept]))
@@ -159,10 +159,10 @@ def marginal_of(
 def stations_on(
     few: State, matches: StationMatches, dense: State, change: Array, covariance: Array
 ) -> dict[int, Array]:
-    """Return where stations of dense curves are on curves with few knots, and their sigmas along: (2, k).
+    """Transfer stations of dense curves to curves with few knots: parameters and sigmas along, (2, k).
 
     A cone is `S_dense(u)`. Given the few control points `F c` it moves by `(B_dense(u) - B_few(u') F) dc`,
-    with u' its foot point on the few curve, B the basis, and dc of the given covariance.
+    where u' is its foot point on the curve with few knots, B the basis, and dc has the given covariance.
     """
     found = {}
     for curve in matches.stations.curves:
@@ -178,7 +178,7 @@ def stations_on(
 
 
 def along_of(boundary: Boundary, u: Array, directions: Array) -> Array:
-    """Return the derivatives (k, 2 m) of `d . S(u)` by the control points, for unit vectors d (k, 2)."""
+    """Derivatives (k, 2 m) of `d . S(u)` by the control points, for unit vectors d (k, 2)."""
     (basis,), span = boundary.tables.evaluate(u)
     by_control = np.zeros((len(u), boundary.size, 2))
     terms = basis[:, :, None] * directions[:, None, :]
@@ -187,7 +187,7 @@ def along_of(boundary: Boundary, u: Array, directions: Array) -> Array:
 
 
 def rows_before(system: BatchSystem, at: Evaluation, first_kept: int) -> list[Rows]:
-    """Return the rows of the batch that hold a pose before `first_kept` or no pose at all."""
+    """Select the rows of the batch with a pose before `first_kept` or without a pose."""
     state, sigma, before = at.state, system.sigma_slide, []
     gauges = {label: curve_gauge(state, label, sigma, first_kept) for label in state.boundaries}
     for rows in system.rows(at, gauges):

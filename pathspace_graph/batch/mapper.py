@@ -1,9 +1,9 @@
-"""The offline batch: every pose, every detection and both curves of a log in one least-squares problem."""
+"""Offline batch: every pose, every detection and both curves of a log in one least-squares problem."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import gtsam
 import numpy as np
@@ -26,12 +26,12 @@ from pathspace_graph.graph.variables import (
 )
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, joint_covariance
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE_LENGTHS
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.motion import known_noise, size_of_vehicle, with_inflated_priors, with_size
+from pathspace_graph.mapping.motion import known_noise, vehicle_of, with_inflated_priors, with_size
 from pathspace_graph.mapping.orange import OrangeCones, Sighting
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict
@@ -39,7 +39,7 @@ from pathspace_graph.scale import solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .gtsam_graph import nonlinear_graph
-from .objections import speaks_against, unmapped
+from .objections import evidence_against, unmapped
 from .optimizer import Convergence, Optimizer
 from .simplification import Scatter, Simplified, map_block, own_settings, simplified
 from .start import CurveMapper, find_revisits, start_odometry, start_online
@@ -50,7 +50,7 @@ NAME: Final = "spline"  # name of the estimator on the command line
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BatchResult(BatchRun):
-    """The result of a batch optimization, how it ended, and its uncertainty."""
+    """Result of a batch optimization, its convergence, and its uncertainty."""
 
     LENGTHS: ClassVar = RunResult.LENGTHS | {
         **dict.fromkeys(("scatter", "online", "objection"), 0),
@@ -59,27 +59,27 @@ class BatchResult(BatchRun):
 
     convergence: Convergence
     map_covariance: Array
-    """Joint covariance (2m, 2m) of the control points of both boundaries, left first, in m^2. It comes from
-    the measurements alone: the scatter of the cones isn't added."""
+    """Joint covariance (2m, 2m) of the control points of both boundaries, left first, in m^2, from the
+    measurements alone, without the scatter of the cones."""
     scatter: Scatter
-    """Distance of the cones from the map's curves, which have too few control points to follow them."""
+    """Distance of the cones from the map's curves, which have too few control points to meet them."""
     calibration: Array
-    """Calibration (2,): scale error of the speeds [-], bias of the yaw rate [rad/s]."""
+    """Calibration (2,): scale error of the speeds (-), bias of the yaw rate (rad/s)."""
     online: RunResult | None
-    """Online run that the batch began with, if it did."""
+    """Online run in which the batch began, if any."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall time of each stage (s)."""
     system: BatchSystem
     """Problem that was solved, on curves with about one knot for each cone."""
     optimum: Evaluation
     objection: str = ""
-    """What speaks against the map as a whole; empty where nothing does."""
+    """Evidence against the map as a whole; empty if there is none."""
     drive: int = 0
-    """Number of the drive, of those in the problem."""
+    """Index of the drive in the problem."""
 
     @cached_property
     def pose_covariances(self) -> Array:
-        """Return the marginal covariance (n, 3, 3) of each pose (x, y, theta), map frame, computed once."""
+        """Marginal covariance (n, 3, 3) of each pose (x, y, theta), map frame, computed once."""
         with threadpool_limits(limits=1):
             weights = self.scale ** np.array(POSE_LENGTHS, float)
             marginals = self.system.eliminated(self.optimum).pose_marginals
@@ -90,23 +90,23 @@ class BatchResult(BatchRun):
 
     @property
     def cycles_of_drive(self) -> slice:
-        """Return the drive's cycles among those of the problem."""
+        """Cycles of the drive in the problem."""
         state = self.optimum.state
         return state.drives.parts(len(state.poses))[self.drive]
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Return the whole problem at the optimum by `nonlinear_graph`; its lengths are over the scale."""
+        """Return the whole problem at the optimum by `nonlinear_graph`; lengths are divided by the scale."""
         return nonlinear_graph(self.system, self.optimum)
 
     def values(self) -> gtsam.Values:
-        """Return the optimum over the scale: control points l_j and r_j, calibration b_0, poses x_k."""
+        """Return the optimum divided by the scale: control points l_j and r_j, calibration b_0, poses x_k."""
         variables = self.optimum.state.variables
         return variables.gtsam_values(variables.keys)
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """An optimum, and how the search for it ended."""
+    """An optimum and its convergence."""
 
     optimizer: Optimizer
     at: Evaluation
@@ -114,7 +114,7 @@ class Found:
 
     @property
     def system(self) -> BatchSystem:
-        """Return the problem that was solved."""
+        """Problem that was solved."""
         return self.optimizer.system
 
 
@@ -127,23 +127,23 @@ class BatchMapper:
         odometry_sigma: Array | KnownNoise | None = None,
         online: Callable[[MapperSettings, KnownNoise], CurveMapper] | None = None,
     ) -> None:
-        """Keep the settings, and the standard deviation (3,) of a measured twist (m/s, m/s, rad/s).
+        """Take the settings and the standard deviation (3,) of a measured twist (m/s, m/s, rad/s).
 
-        `online` makes the online mapper whose map the optimization begins with, if not at odometry.
+        `online` makes an online mapper, whose map is the start of the optimization if odometry is not.
         """
         self.settings = known_settings(settings)
         self.online = online
         self.odometry_sigma = odometry_sigma
-        known_noise(odometry_sigma)  # a wrong one is refused here
+        known_noise(odometry_sigma)  # check it early
 
     def solve(
         self, log: Log, start: Start | None = None, on_round: Callable[[], None] | None = None
     ) -> BatchResult:
-        """Return the optimum, which is searched from odometry alone or from an online map.
+        """Search the optimum, from odometry alone or from an online map.
 
         `start` is by default `batch.start` of the settings. `on_round` is called after each round.
-        SettingsError if there is no online mapper to begin with, and SolveError where the log leaves no way
-        to an optimum.
+        SettingsError if the start needs an online mapper and there is none, SolveError if the log does not
+        determine an optimum.
         """
         settings = with_kind(self.settings, log)
         return solved(partial(self._solve, settings, start, on_round), log, settings)
@@ -161,36 +161,18 @@ class BatchMapper:
         watch.lap("integrate")
         start, given = start or settings.batch.start, replace(settings, scale=scale)
         begun, online = self._search(log, judged, replace(settings, scale=1.0), noise, start, on_round, watch)
-        found, known = _with_wider_priors(begun)
+        found, known = with_wider_priors(begun)
         watch.lap("optimum")
-        at, convergence, settings = found.at, found.convergence, found.system.settings
-        joint, vehicle = map_covariance(at.state, known, settings), vehicle_of(at.state, known, settings)
-        watch.lap("covariance")
-        few = simplified(at.state, found.system.detections, settings)
-        joint = few.change @ joint @ few.change.T
-        watch.lap("simplify")
-        records, laps = records_of(few, judged.chain, sum(watch.laps.values()))
-        return BatchResult(
-            estimator=NAME,
+        solved_map = map_of(found, known, _orange(judged, found.at.state), watch)
+        return result_of(
+            found,
+            known,
+            solved_map,
             settings=settings_dict(given),
-            map=replace(map_of(few, joint, settings), points=_orange(judged, at.state)),
-            scatter=few.scatter,
-            trajectory_t=judged.chain.stamps,
-            trajectory=at.state.poses.copy(),
-            cycles=records,
-            laps=laps,
-            converged=convergence.converged,
-            cost=convergence.cost,
-            convergence=convergence,
-            map_covariance=joint,
-            calibration=at.state.variables.calibration.copy(),
             noise=judged.noise,
-            vehicle=vehicle,
+            chain=judged.chain,
             online=online,
             seconds=watch.laps,
-            system=found.system,
-            optimum=at,
-            objection=unmapped(few.detections, few.state.poses),
         )
 
     def _search(
@@ -203,7 +185,7 @@ class BatchMapper:
         on_round: Callable[[], None] | None,
         watch: Stopwatch,
     ) -> tuple[Found, RunResult | None]:
-        """Return the optimum, and the online run that the search began with, if it did."""
+        """Return the optimum, and the online run in which the search began, if any."""
         revisits: Sequence[Revisit] = ()
         if start != "online":
             revisits = find_revisits(judged)
@@ -213,7 +195,7 @@ class BatchMapper:
             if found is not None:
                 return found, None
         if self.online is None:
-            raise SettingsError("start online: expected an online mapper to begin with, found none")
+            raise SettingsError("start online: expected an online mapper, found none")
         watch.lap("optimum")
         mapper = self.online(settings, noise)
         state, online = start_online(log, mapper)
@@ -230,20 +212,20 @@ class BatchMapper:
 def _optimizer(
     judged: JudgedLog, on_round: Callable[[], None] | None, revisits: Sequence[Revisit] = ()
 ) -> Optimizer:
-    """Return an optimizer with a system and detections of its own, so no search begins with another's."""
+    """Make an optimizer with a system and detections of its own, independent of other searches."""
     detections = DetectionTable.of(judged.cycles, twists=judged.chain.twists)
     return Optimizer(BatchSystem(detections, judged.chain, judged.settings, revisits), on_round=on_round)
 
 
 def find_from_odometry(optimizer: Optimizer) -> Found:
-    """Return the optimum whose search begins with odometry, and the places that were met again."""
+    """Search the optimum from odometry and revisits."""
     return Found(optimizer, *optimizer.find(start_odometry(optimizer.system)))
 
 
 def find_closed_optimum(optimizer: Optimizer) -> Found | None:
-    """Return the optimum whose search begins with odometry and the places that were met again.
+    """Search the optimum from odometry and revisits.
 
-    None where there are none, the search fails, or something speaks against the map.
+    None without revisits, if the search fails, or with evidence against the map.
     """
     system = optimizer.system
     if not system.revisits:
@@ -252,51 +234,113 @@ def find_closed_optimum(optimizer: Optimizer) -> Found | None:
         found = find_from_odometry(optimizer)
     except SolveError:
         return None
-    against = speaks_against(system, found.at, found.at.state.splines, system.detections)
+    against = evidence_against(system, found.at, found.at.state.splines, system.detections)
     return None if against else found
 
 
-def _with_wider_priors(found: Found) -> tuple[Found, FactoredSystem]:
-    """Return the optimum, searched again while it contradicts the prior of a calibration, and `_known`."""
-    system, variables = found.system, found.at.state.variables
+def with_wider_priors(found: Found) -> tuple[Found, FactoredSystem]:
+    """Search the optimum again while it contradicts the prior of a calibration; return it and `known_of`."""
+    system, state, widened = found.system, found.at.state, False
     known = known_of(system, found.at)
-    variance = np.diag(known.covariance(variables.calibration_keys))
-    inflated = with_inflated_priors(variables.calibrations, variance, system.settings)
-    if inflated == system.settings:
+    for drive, settings in enumerate(system.priors):
+        keys = state.calibration_keys(drive)
+        variance = np.diag(known.covariance(keys))
+        wider = with_inflated_priors(state.variables.of(keys), variance, settings)
+        if wider != settings:
+            system.widen_priors(drive, wider)
+            widened = True
+    if not widened:
         return found, known
-    system.widen_priors(inflated)
-    return _with_wider_priors(Found(found.optimizer, *found.optimizer.find(found.at.state)))
+    return with_wider_priors(Found(found.optimizer, *found.optimizer.find(state)))
 
 
 # --- the parts of a result -------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class SolvedMap:
+    """The map of an optimum."""
+
+    few: Simplified
+    joint: Array  # (n, n) covariance of the control points, without the scatter of the cones (m^2)
+    map: Map
+
+
+def map_of(
+    found: Found, known: FactoredSystem, orange: Mapping[int, PointBoundary], watch: Stopwatch
+) -> SolvedMap:
+    """Simplify the curves of an optimum, and propagate their covariance."""
+    state, settings = found.at.state, found.system.settings
+    points, size = state.map_points.ravel(), settings.odometry.sigma_size
+    joint = with_size(known.covariance(state.map_keys), points, size)
+    watch.lap("covariance")
+    few = simplified(state, found.system.detections, settings)
+    joint = few.change @ joint @ few.change.T
+    watch.lap("simplify")
+    return SolvedMap(few, joint, replace(_map_of_curves(few, joint, settings), points=dict(orange)))
+
+
+def result_of(
+    found: Found,
+    known: FactoredSystem,
+    solved_map: SolvedMap,
+    *,
+    settings: dict[str, Any],
+    noise: RunNoise | None,
+    chain: LogOdometry,
+    seconds: dict[str, float],
+    online: RunResult | None = None,
+    drive: int = 0,
+) -> BatchResult:
+    """Return the result of one drive; `seconds` are the wall times of all of them together."""
+    state, few, convergence = found.at.state, solved_map.few, found.convergence
+    parts = state.drives.parts(len(state.poses))
+    poses, own = state.poses[parts[drive]].copy(), few.detections.of_drive(drive)
+    records, laps = records_of(few, chain, sum(seconds.values()) / len(parts), drive)
+    vehicle = _vehicle_of(found, known, drive)
+    return BatchResult(
+        estimator=NAME,
+        settings=settings,
+        map=solved_map.map,
+        scatter=few.scatter,
+        trajectory_t=chain.stamps,
+        trajectory=poses,
+        cycles=records,
+        laps=laps,
+        converged=convergence.converged,
+        cost=convergence.cost,
+        convergence=convergence,
+        map_covariance=solved_map.joint,
+        calibration=vehicle.calibration,
+        noise=noise,
+        vehicle=vehicle,
+        online=online,
+        seconds=seconds,
+        system=found.system,
+        optimum=found.at,
+        objection=unmapped(replace(own, cycle=own.cycle - parts[drive].start), poses),
+        drive=drive,
+    )
+
+
 def known_of(system: BatchSystem, at: Evaluation) -> FactoredSystem:
-    """Return the system of the map, the calibrations and each last pose, with all other poses eliminated."""
+    """Factorize the system of the map, the calibrations and each last pose; other poses are eliminated."""
     keys, state = at.state.variables.layout.keys, at.state
     last = [pose_key(part.stop - 1) for part in state.drives.parts(len(state.poses))]
     kept = Layout(keys[~are_poses(keys) | np.isin(keys, last)])
     return FactoredSystem(kept, cholesky(eliminated_system(system.linear_graph(at), kept)[0]))
 
 
-def map_covariance(state: State, known: FactoredSystem, settings: MapperSettings) -> Array:
-    """Return the joint covariance (n, n) of the control points, in m^2."""
-    points = state.map_points.ravel()
-    return with_size(known.covariance(state.map_keys), points, settings.odometry.sigma_size)
-
-
-def vehicle_of(state: State, known: FactoredSystem, settings: MapperSettings, drive: int = 0) -> VehicleState:
+def _vehicle_of(found: Found, known: FactoredSystem, drive: int) -> VehicleState:
     """Return the last pose of a drive and its calibration, with their joint covariance."""
+    state, size = found.at.state, found.system.settings.odometry.sigma_size
     last, keys = state.drives.parts(len(state.poses))[drive].stop - 1, state.calibration_keys(drive)
-    pose, calibrations = state.poses[last], state.variables.of(keys)
     covariance = known.covariance(np.append(pose_key(last), keys))
-    values = size_of_vehicle(pose, len(calibrations))
-    covariance = with_size(covariance, values, settings.odometry.sigma_size)
-    return VehicleState.split(pose, calibrations, covariance)
+    return vehicle_of(state.poses[last], state.variables.of(keys), covariance, size)
 
 
-def map_of(few: Simplified, joint: Array, settings: MapperSettings) -> Map:
-    """Return the curves with their covariance, to which the scatter of the cones is added, and the cones."""
+def _map_of_curves(few: Simplified, joint: Array, settings: MapperSettings) -> Map:
+    """Return the curves with their cones, and their covariance plus the scatter of the cones."""
     state, boundaries = few.state, {}
     has_cones = state.closed and not settings.lines
     for label, boundary in state.boundaries.items():
@@ -318,16 +362,16 @@ def _orange(judged: JudgedLog, state: State) -> dict[int, PointBoundary]:
 
 
 def records_of(
-    few: Simplified, chain: LogOdometry, seconds: float, drive: int = 0
+    few: Simplified, chain: LogOdometry, seconds: float, drive: int
 ) -> tuple[tuple[CycleRecord, ...], int]:
-    """Return a record of each cycle of a drive, with its share of the seconds, and its complete laps."""
+    """Return a record of each cycle of a drive, with its share of the seconds, and the complete laps."""
     state, detections = few.state, few.detections
     part = state.drives.parts(len(state.poses))[drive]
     left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))
     used = np.bincount(detections.cycle[detections.used], minlength=part.stop)[part].tolist()
     offered = np.bincount(detections.cycle, minlength=part.stop)[part].tolist()
     poses, counter, share = state.poses[part], LapCounter(), seconds / len(chain)
-    if drive > 0:  # laps are counted from where the drive began
+    if drive > 0:  # count laps from the start of the drive
         poses = compose(inverse(frame_of(chain, poses)), poses)
     records = tuple(
         CycleRecord(k, t, share, left, right, used[k], counter.update(poses[k]), offered=offered[k])
@@ -337,5 +381,5 @@ def records_of(
 
 
 def frame_of(chain: LogOdometry, poses: Array) -> Array:
-    """Return the pose (3,) of the vehicle at the first stamp of a drive with poses (P, 3) of its cycles."""
+    """Pose (3,) of the vehicle at the first stamp of a drive, given the poses (P, 3) of its cycles."""
     return compose(poses[0], inverse(chain.first))

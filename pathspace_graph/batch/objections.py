@@ -1,4 +1,4 @@
-"""What speaks against an optimum: against a loop that is to be closed, and against a map as a whole."""
+"""Evidence against an optimum: against closing a loop on it, and against the map as a whole."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -19,21 +19,23 @@ from pathspace_graph.spline.bspline import BSpline
 from .start import aligned_odometry
 from .system import BatchSystem, Evaluation
 
-DRIVE_RATIO: Final = 2.5  # most ratio of a boundary point's distance from the drive to the drive's beside it
-DRIVE_PERCENTILE: Final = 95.0  # of the poses' distances: the drive may begin or end off the track
-BENT_SIGMAS: Final = 4.0  # most distance of an optimum's poses from odometry and revisits (sigmas)
+DRIVE_RATIO: Final = 2.5  # largest distance of a boundary from the drive, relative to the drive's from it
+DRIVE_PERCENTILE: Final = 95.0  # percentile of the poses' distances: the drive may begin or end off the track
+BENT_SIGMAS: Final = 4.0  # largest distance of an optimum's poses from odometry and revisits (sigmas)
 MISS_STRETCH: Final = 25.0  # length of the stretches of the drive by which a miss is located (m)
-MISS_DETECTIONS: Final = 20  # number of detections below which a stretch says nothing
-MISS_NEAR: Final = 2.5  # farthest from the drive that detections are near it, by used ones' usual distance
-MISS_SHARE: Final = 1.0 / 3.0  # least share of the detections near the drive on no boundary that is a miss
-MISS_SHOWN: Final = 3  # most stretches that are told
+MISS_DETECTIONS: Final = 20  # least number of detections of such a stretch
+MISS_NEAR: Final = (
+    2.5  # largest distance of near detections from the drive, relative to the used ones' median
+)
+MISS_SHARE: Final = 1.0 / 3.0  # least share of near detections on no boundary that is a miss
+MISS_SHOWN: Final = 3  # largest number of reported stretches
 
 
 def share_used(at: Evaluation, detections: DetectionTable) -> float:
-    """Return the share of the coloured detections of the first lap that lies on the curves of an optimum."""
+    """Share of the coloured detections of the first lap that lie on the curves of an optimum."""
     state = at.state
     coloured = np.isin(detections.label, list(state.boundaries))
-    again = np.ones(len(state.poses), bool)  # beside a stretch of every boundary that was driven before
+    again = np.ones(len(state.poses), bool)  # beside a previously driven stretch of every boundary
     for label, boundary in state.boundaries.items():
         again &= state.pose_u[label] - state.pose_u[label][0] >= boundary.length
     first = coloured & ~again[detections.cycle]
@@ -41,12 +43,11 @@ def share_used(at: Evaluation, detections: DetectionTable) -> float:
 
 
 def objection(splines: Mapping[int, BSpline], poses: Array, used: float, settings: MapperSettings) -> str:
-    """Return what speaks against a map of closed curves around the poses (P, 3) of a lap; empty for nothing.
+    """Describe the evidence against a map of closed curves around the poses (P, 3) of a lap; empty if none.
 
-    Both boundaries are closed. They don't cross but at level crossings, the vehicle crosses neither and has
-    driven beside all of both, and a large share of the detections is `used`: it lies on them. Where cycles
-    are missing the drive is not known, so nothing is asked of the boundaries beside a step so long that a
-    point beside its middle would be too far from both poses.
+    Both boundaries must be closed, and cross only at level crossings. The vehicle must cross neither, and
+    drive beside all of both. A large share of the detections must be `used`. Beside a gap between two cycles
+    the boundaries are not tested if a point beside its middle would be too far from both poses.
     """
     if set(splines) != set(BOUNDARIES) or not all(spline.periodic for spline in splines.values()):
         return "not both of its boundaries are closed"
@@ -65,26 +66,26 @@ def objection(splines: Mapping[int, BSpline], poses: Array, used: float, setting
             known[np.arange(first, last if last >= first else last + len(curve)) % len(curve)] = False
         wider = float(np.max(by_drive.query(curve[known])[0])) / aside
         if wider > DRIVE_RATIO:
-            return f"a boundary would be {wider:.1f} times as far from the drive as it is beside it"
+            return f"a boundary would be {wider:.1f} times as far from the drive as the drive is from it"
     if used < settings.batch.closure.used:
         return f"only {used:.0%} of the detections lie on its boundaries".replace("%", " %")
     return ""
 
 
-def speaks_against(
+def evidence_against(
     system: BatchSystem, at: Evaluation, splines: Mapping[int, BSpline], detections: DetectionTable
 ) -> str:
-    """Return what speaks against closed curves at an optimum, on which detections lie; empty for nothing."""
+    """Describe the evidence against closed curves at an optimum, with their detections; empty if none."""
     poses = at.state.poses
     used = share_used(at, detections)
     return disagreement(system, poses) or objection(splines, poses, used, system.settings)
 
 
 def disagreement(system: BatchSystem, poses: Array) -> str:
-    """Return that the poses (P, 3) of an optimum are not those of odometry and revisits; empty if they are.
+    """Describe how the poses (P, 3) of an optimum contradict odometry and revisits; empty if they agree.
 
-    Both are estimates of one drive, so their distance is some standard deviations of the less certain one. A
-    wrong optimum bends the drive to the map, by much more.
+    Both are estimates of one drive, so they differ by some standard deviations of the less certain one. A
+    wrong optimum bends the drive by much more, to fit the map.
     """
     if not system.revisits:
         return ""
@@ -93,9 +94,9 @@ def disagreement(system: BatchSystem, poses: Array) -> str:
 
 
 def unmapped(detections: DetectionTable, poses: Array) -> str:
-    """Return that a third of what was detected near a drive lies on no boundary, and where; or nothing.
+    """Describe where a third of the detections near a drive lie on no boundary; empty if they do not.
 
-    What is far from the drive may be of another road, or no cone.
+    Detections far from the drive may be of another road, or false.
     """
     if len(detections.cycle) == 0:
         return ""
@@ -113,5 +114,5 @@ def unmapped(detections: DetectionTable, poses: Array) -> str:
     ends = np.minimum(MISS_STRETCH * edges.reshape(-1, 2), driven[-1]).tolist()[:MISS_SHOWN]
     told = [Text("{a:.3g} to {b:.3g} m", a=Length(a), b=Length(b)) for a, b in ends]
     where = Text(" ({stretches} of the drive)", stretches=joined(told, ", ")) if told else ""
-    said = "{share:.0f} % of what was detected near the drive lies on no boundary{where}"
+    said = "{share:.0f} % of the detections near the drive lie on no boundary{where}"
     return Text(said, share=100.0 * missed.sum() / near.sum(), where=where)

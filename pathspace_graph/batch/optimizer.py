@@ -22,33 +22,32 @@ from .system import LOOSE_GATE, BatchSystem, Biweight, Evaluation, moved
 
 GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
 CHANGED_SHARE: Final = 1e-3  # largest share of detections that change in the last round of associations
-POSE_STEPS: Final = 1  # Gauss-Newton steps of the poses alone at first, while the map of the start is held
-TOLERANCE_DECREASE: Final = 0.05  # most decrease of the cost that the last step predicts; one sigma has 1/2
-ROUGH_TOLERANCE: Final = 100.0  # its factor before the last optimization, on knots or stations that change
-CREEP_SHARES: Final = (0.3, 0.97)  # of a step in the one before, between which it is extrapolated
+TOLERANCE_DECREASE: Final = 0.05  # largest predicted decrease of the cost in the last step; one sigma is 1/2
+ROUGH_TOLERANCE: Final = 100.0  # factor of the tolerance while knots or stations still change
+CREEP_SHARES: Final = (0.3, 0.97)  # ratio of a step to the last one between which it is extrapolated
 
 
 @dataclass(frozen=True, eq=False)
 class Convergence:
     """End of an optimization."""
 
-    converged: bool  # whether nothing changed any more
+    converged: bool
     reason: str
-    rounds: int  # times that foot points, gates and weights were refreshed
+    rounds: int  # number of refreshes of foot points, gates and weights
     steps: int  # Levenberg-Marquardt steps, including rejected ones
     cost: float  # half the sum of squares with robust losses at the end
     gradient: float
-    """Norm `sqrt(g' H^-1 g)` of the gradient g, with H the information of all variables: the length of the
-    last step in joint sigmas, or of the next one where it did not converge. A slow common motion of the whole
-    map counts as much in it as that of a control point."""
+    """Norm `sqrt(g' H^-1 g)` of the gradient g, with the information H of all variables: the length of the
+    last step in joint sigmas, or of the next one without convergence. A slow motion of the whole map counts
+    as much as the motion of one control point."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Length of the search for the optimum of a log."""
+    """Limits of the search for the optimum of a log."""
 
-    rough_rounds: int = 24  # most rounds of the first optimization, on knots that follow the start
-    rounds: int = 80  # most rounds of a later one; one that uses them all is reported as not converged
+    rough_rounds: int = 24  # largest number of rounds of the first optimization, on the knots of the start
+    rounds: int = 80  # largest number of rounds of later ones; all used means not converged
     tolerance: float = 1.0  # factor of the tolerance
 
 
@@ -60,18 +59,18 @@ class Optimizer:
     ) -> None:
         self.system, self.settings = system, system.settings.batch
         self.effort, self.damping, self._on_round = effort or Effort(), Damping(), on_round
-        self.steps = 0  # steps that were tried
-        self._last_step: Array | None = None  # of the map and the calibration
+        self.steps = 0  # number of steps tried
+        self._last_step: Array | None = None  # last step of the map and the calibration
 
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
-        """Return the optimum on curves with about one knot for each cone, which meet the cones.
+        """Find the optimum on curves with about one knot for each cone, which meet the cones.
 
-        Where the curves are closed, their cones hold the detections along them.
+        On closed curves, stations constrain the detections along them.
         """
         detections, settings, rounds = self.system.detections, self.system.settings, self.effort.rounds
         gate = self.settings.gate
         first_gate = gate if self.system.revisits else LOOSE_GATE
-        state = self.align_poses(state, POSE_STEPS, first_gate)
+        state = self.align_poses(state, first_gate)
         state = reknot(state, detections, settings, dense=True)
         at, _ = self.run(state, first_gate, self.effort.rough_rounds, rough=True)
         state = reknot(at.state, detections, settings, dense=True)
@@ -81,26 +80,24 @@ class Optimizer:
         for stations in (False, True):
             at, _ = self.run(state, gate, rounds, rough=True, stations=stations)
             state = at.state
-        return self.run(state, gate, rounds, stations=True)  # more detections are of one cone beside it
+        return self.run(state, gate, rounds, stations=True)  # match again: more cones are unambiguous now
 
-    def align_poses(self, state: State, steps: int, gate: float) -> State:
-        """Return the state after Gauss-Newton steps of the poses alone, beside its map and calibration."""
+    def align_poses(self, state: State, gate: float) -> State:
+        """Take one Gauss-Newton step of the poses alone, with fixed map and calibration."""
         self.system.begin(state)
-        for _ in range(steps):
-            locate_poses(state)
-            at, _ = self._refreshed(state, gate, False)
-            state = moved(state, self.system.poses_alone(at))
-        return state
+        locate_poses(state)
+        at, _ = self._refreshed(state, gate, False)
+        return moved(state, self.system.poses_alone(at))
 
     def run(
         self, state: State, gate: float, rounds: int, rough: bool = False, stations: bool = False
     ) -> tuple[Evaluation, Convergence]:
         """Optimize in rounds until a step is short, and return the problem after it.
 
-        Each round takes one step. The gate (sigmas) shrinks to that of the settings (graduated robust
-        weights), and only then may it end. Once hardly any association changes, all of them and the sigmas
-        stay: where two rows are near, some would change for ever. A `rough` one ends sooner. With `stations`,
-        cones of closed curves hold the detections along them.
+        Each round takes one step. The gate (sigmas) shrinks to that of the settings (graduated
+        non-convexity), and the search ends only afterwards. When hardly any association changes, all of them
+        and the sigmas are fixed: between two near rows, some would change forever. A `rough` search has a
+        looser tolerance. With `stations`, cones of closed curves constrain the detections along them.
         """
         system, tolerance = self.system, TOLERANCE_DECREASE * self.effort.tolerance
         tolerance *= ROUGH_TOLERANCE if rough else 1.0
@@ -128,9 +125,9 @@ class Optimizer:
         return at, Convergence(converged, reason, done, self.steps, at.cost, norm)
 
     def _refreshed(self, state: State, gate: float, strict: bool) -> tuple[Evaluation, int]:
-        """Return the problem with new associations and sigmas, and how many of the associations are new.
+        """Return the problem with new associations and sigmas, and the number of changed associations.
 
-        Its foot points have arrived: else the cost would change without a step.
+        Its foot points have converged; otherwise the cost would change without a step.
         """
         system, detections = self.system, self.system.detections
         before = np.where(detections.used, detections.boundary, UNKNOWN)
@@ -142,13 +139,13 @@ class Optimizer:
         return system.evaluate(state, hold=True), int(changed.sum())
 
     def _keep_foot_points(self, at: Evaluation) -> None:
-        """Let later evaluations refine the foot points from where they are now."""
+        """Let later evaluations refine the foot points from their present places."""
         self.system.detections.refine(at.across.rows, at.u)
 
     def _step(self, at: Evaluation, tolerance: float) -> tuple[Evaluation, float]:
-        """Return the problem after the least damped step that makes the cost smaller, or the same one.
+        """Take the least damped step that decreases the cost; without one, the problem does not change.
 
-        The other is the decrease that the step predicts; none within the tolerance is tried again.
+        Return the problem and the predicted decrease. A step within the tolerance is not tried again.
         """
         self._keep_foot_points(at)
         rows = self.system.rows(at)
@@ -181,7 +178,7 @@ class Optimizer:
         except SingularSystemError:
             return None, np.inf
         decrease = np.inf
-        if self.damping.is_light:  # a step is short as well where the damping holds it
+        if self.damping.is_light:  # a strongly damped step is short without convergence
             decrease = predicted_decrease(rows, state.variables.layout, step)
         trial = system.evaluate(system.retract(state, step))
         if trial.cost > at.cost:
@@ -195,11 +192,11 @@ class Optimizer:
 
 
 def extrapolation_factor(step: Array, before: Array) -> float:
-    """Return `1 / (1 - r)`: how much longer a step (n,) is made, r being its share of the step before.
+    """Factor `1 / (1 - r)` of a step (n,), where r is its ratio to the step before (Aitken's process).
 
-    Aitken's process for vectors, with r by least squares, and 1 where |r| isn't between `CREEP_SHARES`.
-    Robust weights, held sigmas and foot points on a bend let Gauss-Newton converge only linearly: it creeps
-    (r > 0), or oscillates (r < 0), where a shorter step ends it.
+    r is found by least squares. The factor is 1 if |r| is not between `CREEP_SHARES`. Robust weights, fixed
+    sigmas and foot points on a bend make Gauss-Newton converge only linearly: it creeps (r > 0), or
+    oscillates (r < 0) and a shorter step ends it.
     """
     square = float(before @ before)
     share = float(step @ before) / square if square > 0.0 else 0.0
@@ -207,9 +204,10 @@ def extrapolation_factor(step: Array, before: Array) -> float:
 
 
 def predicted_decrease(groups: Sequence[Rows], layout: Layout, step: Array) -> float:
-    """Return `1/2 |r|^2 - 1/2 |J d + r|^2` of all rows after a step d (n,): the gain of the linear problem.
+    """Decrease `1/2 |r|^2 - 1/2 |J d + r|^2` of all rows by a step d (n,), for the linear problem.
 
-    An undamped step has `1/2 g' H^-1 g`, with gradient g and information H: 1/2 where it is one sigma long.
+    For an undamped step it is `1/2 g' H^-1 g`, with gradient g and information H: 1/2 for a step of one
+    sigma.
     """
     after = (kernels.moved_residual(layout, rows, -step) for rows in groups if len(rows))
     return half_square(groups) - sum(0.5 * float(residual @ residual) for residual in after)

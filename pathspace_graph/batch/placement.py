@@ -1,8 +1,8 @@
-"""The place of a drive on the map of others: hypotheses along the road, until one is left.
+"""Placement of a drive on the map of others, by hypotheses along the road.
 
-The way that was driven is laid rigidly beside each place of the known road, and the best places are refined
-by the registration of what was detected. A place is taken if nearly all of that lies on the curves there, the
-cones of a stretch surely lie on known ones, and no other place is nearly as good.
+The driven path is aligned rigidly with the known road at each place, and the best places are refined by the
+registration of detections. A place is accepted if nearly all detections lie on the curves there, the cones of
+a stretch surely lie on known ones, and no other place is nearly as good.
 """
 
 from collections.abc import Sequence
@@ -15,44 +15,44 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import compose, move_points, path_lengths, rotation
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.mapping.constellation import LAID_NEWEST, NEARBY, Constellation, lay
+from pathspace_graph.mapping.constellation import LAID_NEWEST, NEARBY, Constellation, lay, seen_in
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.registration import Motion, Registration, Sightings
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
-PLACE_STEP: Final = 2.0  # distance of the places that are tried, and of the points of a way (m)
-LEAST_DRIVEN: Final = 30.0  # shortest drive that is placed (m)
-LEAST_OF_LINE: Final = 150.0  # the same where no cones confirm the place (m)
-STRETCH: Final = LAID_NEWEST  # of a drive whose cones confirm its place (m)
-MISFIT: Final = 6.0  # most rms distance of both ways at a place that is refined (m)
-SHARE_MISFIT: Final = 0.02  # added to it, as a share of the length of the way
-MOST_PLACES: Final = 12  # places that are refined
-APART: Final = 6.0  # distance of the drive's first pose below which two places are one (m)
-DETECTIONS: Final = 800  # most detections, evenly chosen, that are registered
-SIGMAS_PLACE: Final = (3.0, 3.0, 0.1)  # of the motion about a place before it is refined (m, m, rad)
-REFINEMENTS: Final = 2  # registrations, one from the other
+PLACE_STEP: Final = 2.0  # distance of the places tried, and of the points of a path (m)
+LEAST_DRIVEN: Final = 30.0  # least length of a drive (m)
+LEAST_OF_LINE: Final = 150.0  # least length of a drive without cones that confirm the place (m)
+STRETCH: Final = LAID_NEWEST  # length of a stretch of a drive whose cones confirm the place (m)
+MISFIT: Final = 6.0  # largest rms distance of both paths at a place that is refined (m)
+SHARE_MISFIT: Final = 0.02  # added to it, as a share of the length of the path
+MOST_PLACES: Final = 12  # largest number of places that are refined
+APART: Final = 6.0  # largest distance of the drive's first pose in two hypotheses of one place (m)
+DETECTIONS: Final = 800  # largest number of registered detections, evenly chosen
+SIGMAS_PLACE: Final = (3.0, 3.0, 0.1)  # of the motion at a place before its refinement (m, m, rad)
+REFINEMENTS: Final = 2  # number of consecutive registrations
 SIGMA_FIT: Final = 0.5  # a detection at a distance d from its curve scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)
-MIN_SCORE: Final = 0.6  # least score of a place that is taken
-MARGIN: Final = 0.1  # least lead of its score over that of every other place
+MIN_SCORE: Final = 0.6  # least score of a place
+MARGIN: Final = 0.1  # least lead of the best score over every other place
 
-FIRST_SEEN: Final = 60.0  # path from whose start cones tell the place on an open road (m)
-ABOUT_START: Final = (15.0, 0.3)  # farthest that drives of an open road begin from each other (m, rad)
-SIGMAS_START: Final = (5.0, 2.0, 0.1)  # of that (m, m, rad)
+FIRST_SEEN: Final = 60.0  # length of the first path, whose cones determine the place on an open road (m)
+ABOUT_START: Final = (15.0, 0.3)  # largest distance between the starts of drives of an open road (m, rad)
+SIGMAS_START: Final = (5.0, 2.0, 0.1)  # standard deviations of that distance (m, m, rad)
 
 OTHER_TRACK: Final = "it fits nowhere on the map of the other drives"
 OTHER_WAY: Final = "it goes the other way round"
 TWO_PLACES: Final = "it fits in two places of the map of the other drives"
-OTHER_START: Final = "its cones do not tell where it begins on the open road of the other drives"
+OTHER_START: Final = "its cones do not determine where it begins on the open road of the other drives"
 
 
 class NotPlacedError(Exception):
-    """No place of the map is that of a drive, and why."""
+    """A drive has no sure place on the map; the message says why."""
 
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """A drive that was solved alone: its curves and poses, and its detections on them."""
+    """A drive that was solved alone: curves, poses, and the detections on the curves."""
 
     state: State
     detections: DetectionTable
@@ -60,19 +60,18 @@ class Driven:
 
     @cached_property
     def driven(self) -> Array:
-        """Return the length (m) of the path to each pose (P,)."""
+        """Length (m) of the path to each pose (P,)."""
         return path_lengths(self.state.poses)
 
     def cones(self, begin: float = 0.0, end: float = np.inf) -> Constellation:
-        """Return the cones that were seen on a stretch of the drive (m), in its frame."""
+        """Return the cones detected on a stretch of the drive (m), in its frame."""
         cycles = np.flatnonzero((self.driven >= begin) & (self.driven < end))
-        table = self.detections.cones(self.settings.lines)
-        table = table.where(np.flatnonzero(table.in_cycles(cycles)))
+        table = seen_in(self.detections.cones(self.settings.lines))(cycles)
         return Constellation.of(table, self.state.poses, self.settings.growth)
 
     @cached_property
     def all_cones(self) -> Constellation:
-        """Return the cones of the whole drive."""
+        """Cones of the whole drive."""
         return self.cones()
 
 
@@ -85,9 +84,9 @@ class Place:
 
 
 def find_place(known: Driven, drive: Driven) -> Array:
-    """Return the motion (3,) that lays a drive on a known one; NotPlacedError where none is sure.
+    """Find the motion (3,) of a drive onto a known one; NotPlacedError if none is sure.
 
-    On an open road, which hypotheses along it can't tell apart, both drives began about the same place.
+    Hypotheses along an open road are ambiguous, so both drives must begin at about the same place there.
     """
     least = LEAST_OF_LINE if drive.settings.lines else LEAST_DRIVEN
     if drive.driven[-1] < least:
@@ -107,7 +106,7 @@ def find_place(known: Driven, drive: Driven) -> Array:
 
 
 def _around(known: Driven, drive: Driven, seen: Sightings) -> list[Place]:
-    """Return the places around a closed map where a drive fits, the best first."""
+    """Find the places around a closed map where a drive fits, the best first."""
     loop = way_around(known.state)
     way = resampled(drive.state.poses[:, :2], min(float(drive.driven[-1]), PLACE_STEP * len(loop)))
     places = _places(known.state, seen, beside(loop, way), drive.settings)
@@ -119,7 +118,7 @@ def _around(known: Driven, drive: Driven, seen: Sightings) -> list[Place]:
 
 
 def _about_start(known: Driven, drive: Driven, seen: Sightings) -> list[Place]:
-    """Return the place where the first cones of a drive lie on those of another one."""
+    """Find the place where the first cones of a drive lie on those of a known one."""
     first, others = drive.cones(0.0, FIRST_SEEN), known.cones(0.0, FIRST_SEEN + ABOUT_START[0])
     laid = lay(first, others, np.zeros(3), np.diag(np.array(SIGMAS_START) ** -2), ABOUT_START)
     if laid is None or not laid.is_sure:
@@ -131,9 +130,9 @@ def _about_start(known: Driven, drive: Driven, seen: Sightings) -> list[Place]:
 
 
 def cones_agree(known: Driven, drive: Driven, motion: Array) -> bool:
-    """Return whether the cones of a stretch of a drive, after a motion (3,), surely lie on known ones.
+    """Whether the cones of a stretch of a drive, after a motion (3,), surely lie on known ones.
 
-    A short way fits on many roads; its cones do not.
+    A short path fits on many roads; its cones do not.
     """
     for begin in np.arange(0.0, max(float(drive.driven[-1]) - 0.5 * STRETCH, 1.0), STRETCH).tolist():
         pose = drive.state.poses[drive.driven.searchsorted(begin)]
@@ -146,7 +145,7 @@ def cones_agree(known: Driven, drive: Driven, motion: Array) -> bool:
 
 
 def way_around(known: State) -> Array:
-    """Return points (n, 2), `PLACE_STEP` apart, of the first lap that was driven around a closed map."""
+    """Points (n, 2), `PLACE_STEP` apart, of the first lap around a closed map."""
     label = next(iter(known.boundaries))
     part = known.drives.longest(len(known.poses))
     pose_u = known.pose_u[label][part]
@@ -157,14 +156,14 @@ def way_around(known: State) -> Array:
 
 
 def resampled(path: Array, length: float) -> Array:
-    """Return points of the first length (m) of a path (n, 2), `PLACE_STEP` apart or slightly less."""
+    """Points of the first `length` (m) of a path (n, 2), at most `PLACE_STEP` apart."""
     driven = path_lengths(path)
     at = np.linspace(0.0, length, int(np.ceil(length / PLACE_STEP)) + 1)
     return np.column_stack([np.interp(at, driven, axis) for axis in path.T])
 
 
 def beside(loop: Array, way: Array) -> list[Array]:
-    """Return the motions (3,) that lay a way (m, 2) on a loop (n, 2) where it fits best, the best first."""
+    """Motions (3,) that align a path (m, 2) with a loop (n, 2) where it fits best, the best first."""
     path, around = way @ np.array([1.0, 1j]), loop @ np.array([1.0, 1j])
     places = (np.arange(len(loop))[:, None] + np.arange(len(way))) % len(loop)
     target = around[places]
@@ -185,7 +184,7 @@ def beside(loop: Array, way: Array) -> list[Array]:
 
 
 def sightings(drive: Driven) -> Sightings:
-    """Return detections that lie on the curves of their own drive, in its frame."""
+    """Detections on the curves of their own drive, in its frame."""
     detections = drive.detections
     rows = np.flatnonzero(detections.used & np.isin(detections.boundary, BOUNDARIES))
     rows = rows[:: max(-(-len(rows) // DETECTIONS), 1)]
@@ -194,7 +193,7 @@ def sightings(drive: Driven) -> Sightings:
 
 
 def _places(known: State, seen: Sightings, motions: Sequence[Array], settings: MapperSettings) -> list[Place]:
-    """Return the places registered from motions (3,) where detections lie on the curves, the best first."""
+    """Register detections from motions (3,); return the places on the curves, the best first."""
     kept = np.isin(seen.labels, list(known.boundaries))
     if not kept.any():
         return []
@@ -217,7 +216,7 @@ def _registered(known: State, seen: Sightings, motion: Array, settings: MapperSe
 
 
 def _distances(known: State, labels: IntArray, points: Array) -> Array:
-    """Return the distance (m,) of points (m, 2) from the curves of their labels."""
+    """Distance (m,) of points (m, 2) from the curves of their labels."""
     distance = np.full(len(points), np.inf)
     for label, boundary in known.boundaries.items():
         own = labels == label

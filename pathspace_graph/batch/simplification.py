@@ -1,6 +1,6 @@
-"""Knots of the batch's curves: about one for each cone at the optimum, few of them in the map.
+"""Knots of the batch's curves: about one for each cone at the optimum, few in the map.
 
-Simplification: the optimum's curves on few knots, their covariance, and how far cones lie from them.
+Simplification: the curves of the optimum on few knots, their covariance, and the scatter of cones about them.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -20,17 +20,17 @@ from pathspace_graph.spline.knots import chosen_breaks, fewest_breaks, fit_splin
 
 from .association import ROW_CONES, associate, cones_of_curve, feet_of_cones, locate_poses
 
-MIN_SIZE_SHARE: Final = 0.6  # least share of the largest number of control points that is tried
+MIN_SIZE_SHARE: Final = 0.6  # least number of control points tried, relative to the largest
 ALIKE: Final = (3.0, 0.01)  # parameters on curves of length L through the same cones differ by < a + b L (m)
-NEED_STEP: Final = 1.0  # distance of the points of a line's curve that say how many knots it needs (m)
-MOST_NEEDED: Final = 400  # largest number of these points, which bounds the time
-FOLDS: Final = 4  # groups of the cross-validation, dealt in turn, so that the neighbours of a cone are there
+NEED_STEP: Final = 1.0  # distance of the points of a line's curve that determine its number of knots (m)
+MOST_NEEDED: Final = 400  # largest number of these points; bounds the time
+FOLDS: Final = 4  # groups of the cross-validation, interleaved so that the neighbours of a cone remain
 
 
 def reknot(state: State, detections: DetectionTable, settings: MapperSettings, dense: bool = False) -> State:
-    """Return the state with every curve fitted anew through the cones along it.
+    """Fit every curve of a state again, through the cones along it.
 
-    `dense` places so many knots that the curves meet the cones; else they are as few as the map has.
+    `dense` places enough knots for the curves to meet the cones; otherwise there are as few as in the map.
     """
     state = state.copy()
     for label, boundary in list(state.boundaries.items()):
@@ -42,7 +42,7 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
             spline = fit_line(state.spline(label), settings)
             state.replace_boundary(label, *boundary_of(spline, settings))
             continue
-        if not dense:  # the optimum's curve beside the cones, since some of them are strays
+        if not dense:  # use the optimum's curve beside the cones, some of which are outliers
             points = feet_of_cones(state, cones, label).position
         share, least_share = settings.batch.size_share, MIN_SIZE_SHARE
         if dense:
@@ -57,10 +57,10 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
 def fit_through(
     points: Array, periodic: bool, settings: MapperSettings, share: float, least_share: float = MIN_SIZE_SHARE
 ) -> BSpline:
-    """Return the best curve through ordered cones (k, 2), with at most `share` control points for each.
+    """Fit the best curve through ordered cones (k, 2), with at most `share` control points for each.
 
-    It has at least `least_share` of these. A closed one begins at the cone nearest to the start, so that
-    similar cones give similar knots.
+    It has at least the share `least_share` of that number. A closed curve begins at the cone nearest to the
+    start, so that similar cones give similar knots.
     """
     smallest, degree = settings.spline.min_size, settings.spline.degree
     most = max(smallest, int(share * len(points)))
@@ -71,9 +71,9 @@ def fit_through(
 
 
 def fit_line(spline: BSpline, settings: MapperSettings) -> BSpline:
-    """Return the curve on fewest knots that follows a line's within half of `spline.sigma_shape`.
+    """Fit the curve on fewest knots that follows a line's curve within half of `spline.sigma_shape`.
 
-    So it adds an eighth to that. A line has no number of cones that could say how many it needs.
+    This increases the standard deviation by an eighth. A line has no cones to determine its number of knots.
     """
     own, smallest = settings.spline, settings.spline.min_size
     step = max(NEED_STEP, spline.length() / MOST_NEEDED)
@@ -83,9 +83,9 @@ def fit_line(spline: BSpline, settings: MapperSettings) -> BSpline:
 
 
 def extended(points: Array, beyond: float) -> Array:
-    """Return cones (k, 2) with a point before the first and one after the last, `beyond` (m) straight on.
+    """Add a point before the first and after the last of cones (k, 2), `beyond` (m) straight ahead.
 
-    Half of the last one's detections lie beyond it: a motion of an end there would put some out of use.
+    Half of the last cone's detections lie beyond it. If the curve ended there, its motion would drop some.
     """
     ends, inner = points[[0, -1]], points[[1, -2]]
     ahead = (ends - inner) / np.maximum(np.hypot(*(ends - inner).T), np.finfo(float).tiny)[:, None]
@@ -94,7 +94,7 @@ def extended(points: Array, beyond: float) -> Array:
 
 
 def boundary_of(spline: BSpline, settings: MapperSettings) -> tuple[Boundary, Array]:
-    """Return a boundary that is the given curve, all of it confirmed, and its control points (m, 2)."""
+    """Convert a curve to a confirmed boundary; return it and its control points (m, 2)."""
     spline = spline if spline.periodic else spline.unclamp()
     boundary = Boundary(spline.knots, spline.periodic, exact_settings(settings.spline), settings.gauge)
     boundary.confirmed_end = boundary.tables.high
@@ -102,12 +102,12 @@ def boundary_of(spline: BSpline, settings: MapperSettings) -> tuple[Boundary, Ar
 
 
 def exact_settings(spline: SplineSettings) -> ExactSplineSettings:
-    """Return a curve's settings with foot points that are more exact than online: an optimum needs it."""
+    """Return a curve's settings with more exact foot points than online, as an optimum needs."""
     return ExactSplineSettings(**{entry.name: getattr(spline, entry.name) for entry in fields(spline)})
 
 
 def own_settings(settings: MapperSettings) -> MapperSettings:
-    """Return the settings with the batch's own values in the groups that it shares with online mapping."""
+    """Return the settings with the batch's values in the groups that it shares with online mapping."""
     batch = settings.batch
     return replace(
         settings,
@@ -121,22 +121,22 @@ def own_settings(settings: MapperSettings) -> MapperSettings:
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Distance of cones from the simplified curves: a variance to be added to that of the curves.
+    """Distance of cones from the simplified curves, a variance to add to that of the curves.
 
     `sigma^2(u) = seen^2 + (d / s)^2 (unseen^2 - seen^2)`, where d is the distance along the curve from u to
-    the nearest detected cone, and s the usual distance of two such cones. A cone that was never detected (d =
-    s) is missed by as much as a detected one that is left out of knots and fit.
+    the nearest detected cone, and s the median distance of two such cones. A cone that was never detected (d
+    = s) is missed by as much as a detected one that is left out of knots and fit.
     """
 
     LENGTHS: ClassVar = {"seen": 1, "unseen": 1, "places": 1, "lengths": 1}
 
-    seen: float  # root mean square distance of the detected cones from the curves (m)
-    unseen: float  # root mean square distance of the same cones from curves that are fitted without them (m)
-    places: dict[int, Array]  # parameters (k,) of the detected cones of each boundary (m)
-    lengths: dict[int, float]  # length of each closed curve in units of its parameter, else infinity
+    seen: float  # rms distance of the detected cones from the curves (m)
+    unseen: float  # rms distance of the same cones from curves that are fitted without them (m)
+    places: dict[int, Array]  # (k,) parameters of the detected cones of each boundary (m)
+    lengths: dict[int, float]  # length of each curve in its parameter (m); infinite if open
 
     def sigma(self, label: int, u: Array) -> Array:
-        """Return the standard deviation (m,) of the scatter at parameters u (m,) of a boundary, in m."""
+        """Standard deviation (m,) of the scatter at parameters u (m,) of a boundary, in m."""
         places = self.places.get(label, np.zeros(0))
         if len(places) < 2:
             return np.full(len(u), self.unseen)
@@ -149,10 +149,10 @@ class Scatter:
         return np.asarray(np.sqrt(self.seen**2 + share**2 * max(self.unseen**2 - self.seen**2, 0.0)))
 
     def of_control_points(self, label: int, boundary: Boundary) -> Array:
-        """Return the standard deviation (m,) that gives a boundary's curve the scatter, in m.
+        """Standard deviation (m,) of control points that gives a boundary's curve the scatter, in m.
 
-        A curve is the mean of some control points with weights beta, so independent errors of these are
-        divided by `sqrt(sum beta^2)`.
+        A point of a curve is a mean of control points with weights beta, which reduces their independent
+        errors by `sqrt(sum beta^2)`.
         """
         u = boundary.abscissae
         (basis,), _ = boundary.tables.evaluate(u)
@@ -162,9 +162,9 @@ class Scatter:
 def scatter_about(
     state: State, optimum: State, detections: DetectionTable, settings: MapperSettings
 ) -> Scatter:
-    """Return the scatter of the detected cones about the curves of the state.
+    """Compute the scatter of the detected cones about the curves of the state.
 
-    Of a line, it is that of the curve of the optimum, which follows it everywhere.
+    For a line, it is the scatter of the optimum's curve, which follows the line everywhere.
     """
     seen, unseen, places, lengths = [], [], {}, {}
     for label, boundary in state.boundaries.items():
@@ -185,7 +185,7 @@ def scatter_about(
 
 
 def cross_validated(points: Array, periodic: bool, settings: MapperSettings, share: float) -> Array:
-    """Return the distance of each cone (k, 2) from a curve that is fitted without it, in m, in any order."""
+    """Distances of cones (k, 2) from curves that are fitted without them, in m, in any order."""
     number = np.arange(len(points))
     ends = np.zeros(len(points), bool) if periodic else (number == 0) | (number == len(points) - 1)
     distances = [np.zeros(0)]
@@ -211,20 +211,20 @@ def _rms(parts: list[Array]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Simplified:
-    """The poses of an optimum beside curves on few knots."""
+    """The poses of an optimum with curves on few knots."""
 
     state: State
     change: Array  # F (k, n) of all control points
-    detections: DetectionTable  # a copy, associated with these curves
+    detections: DetectionTable  # copy, associated with these curves
     scatter: Scatter
 
 
 def simplified(state: State, detections: DetectionTable, settings: MapperSettings) -> Simplified:
-    """Return the same poses beside curves on few knots.
+    """Return the same poses with curves on few knots (paper: Simplification).
 
-    The paper's Simplification: `C_new = F C_old`, so the covariance is `F Sigma F'`. The optimum isn't solved
-    for on few knots: such a curve passes its cones by a decimetre, on the same side in every lap, which turns
-    vehicle and map by up to a degree in the first seconds. The detections are associated with the new curves.
+    `C_new = F C_old`, so the covariance is `F Sigma F'`. The optimum itself is not solved on few knots: such
+    a curve misses its cones by a decimetre, on the same side in every lap, which rotates vehicle and map by
+    up to a degree in the first seconds. The detections are associated with the new curves.
     """
     few = reknot(state, detections, settings)
     change = np.zeros((few.map_points.size, state.map_points.size))
@@ -239,7 +239,7 @@ def simplified(state: State, detections: DetectionTable, settings: MapperSetting
 
 
 def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:
-    """Return F (m_new, m_old): least squares over points of the old curve and their feet on the new."""
+    """Fit F (m_new, m_old) by least squares over points of the old curve and their feet on the new one."""
     splines = old.spline(old_points), new.spline(new_points)
     if new.periodic:
 
@@ -247,7 +247,7 @@ def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Ar
             return new.find_anywhere(new_points, old.evaluate(old_points, u)).u
 
         return refit(*splines, nearest_on_new).new_from_old
-    # an open curve that passes the same cones again lies on itself, so it is searched near the same place
+    # an open curve that passes the same cones again lies on itself: search near the same parameter
     ends, quarter = np.array([new.tables.low, new.tables.high]), 0.25 * (old.tables.high - old.tables.low)
     low = np.array([old.tables.low, old.tables.high - quarter])
     first, last = old.find(old_points, new.evaluate(new_points, ends), low, low + quarter).u.tolist()
@@ -262,5 +262,5 @@ def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Ar
 
 
 def map_block(state: State, label: int) -> slice:
-    """Return where the control points of a boundary are in a joint covariance of all boundaries."""
+    """Block of a boundary's control points in a joint covariance of all boundaries."""
     return Layout(state.map_keys).block(CONTROL_LETTERS[label])

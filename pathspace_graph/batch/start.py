@@ -1,7 +1,7 @@
 """The start of the batch: from an online run of the same log, or from odometry alone.
 
-From odometry, the places that are met again say how long a lap is and bring the laps together, and the curves
-begin as those through the cones beside lap 1.
+From odometry, revisits determine the length of a lap and align the laps, and the first curves go through the
+cones beside lap 1.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import path_lengths, relative, rotated, to_map, wrap_angle
 from pathspace_graph.front_end.front_end import JudgedLog
@@ -28,6 +28,7 @@ from pathspace_graph.mapping.constellation import (
     find_return,
     return_to_beginning,
     revisit_of,
+    seen_in,
 )
 from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
@@ -40,16 +41,16 @@ from .association import ROW_CONES, add_drive, cluster
 from .simplification import boundary_of, exact_settings, fit_through
 from .system import BatchSystem
 
-ALIGN_STEPS: Final = 8  # most Gauss-Newton steps that bring the passes of a place together
-ALIGN_TOLERANCE: Final = 0.1  # largest move of a step at which they are together (m, rad)
-OFF: Final = 0.3  # most misfit of a revisit (sigmas of `NEARBY`) beside which the next one is searched for
+ALIGN_STEPS: Final = 8  # largest number of Gauss-Newton steps that align the passes of a place
+ALIGN_TOLERANCE: Final = 0.1  # largest change in the last of these steps (m, rad)
+OFF: Final = 0.3  # largest misfit of a revisit (sigmas of `NEARBY`) without a new alignment
 REVISIT_INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
 LAP_SHARE: Final = 0.7  # least share of a lap between two passes
-START_MAX_LATERAL: Final = 15.0  # distance from the driven path within which a boundary has detections (m)
+START_MAX_LATERAL: Final = 15.0  # largest distance of a boundary's detections from the driven path (m)
 
 
 class CurveMapper(OnlineEstimator, Protocol):
-    """An online estimator with curves, with whose map the batch can begin."""
+    """An online estimator with curves, whose map can be the start of the batch."""
 
     @property
     def boundaries(self) -> dict[int, Boundary]: ...
@@ -64,7 +65,7 @@ class CurveMapper(OnlineEstimator, Protocol):
 
 
 def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
-    """Return the final map of an online run with all of its poses, and the run."""
+    """Run an online estimator; return its final map with all of its poses, and the run."""
     run, state = run_online(log, mapper), State()
     for label, known in mapper.boundaries.items():
         boundary = Boundary(known.knots, known.periodic, exact_settings(known.settings), known.gauge)
@@ -79,7 +80,7 @@ def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
 
 
 def unwrap(poses: Array) -> Array:
-    """Return poses (n, 3) whose headings have no jump."""
+    """Remove the jumps of the headings of poses (n, 3)."""
     return np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]) if len(poses) else poses
 
 
@@ -87,16 +88,13 @@ def unwrap(poses: Array) -> Array:
 
 
 def start_odometry(system: BatchSystem) -> State:
-    """Return poses by odometry and revisits, and curves through the cones that were seen in the first lap.
+    """Start from poses by odometry and revisits, and curves through the cones detected in the first lap.
 
     The curves are closed if there is a revisit: the first one ends a lap.
     """
     detections, settings, revisits = system.detections, system.settings, system.revisits
-    aligned, calibration, state = (
-        aligned_odometry(system.chain, revisits),
-        np.array(settings.calibrations),
-        State(),
-    )
+    aligned, state = aligned_odometry(system.chain, revisits), State()
+    calibration = np.array(settings.calibrations)
     calibration[:CALIBRATION_SIZE] = aligned.calibration
     detections.correct(calibration[CALIBRATION_SIZE:])
     lap = length_of_lap(aligned.poses, revisits[0]) if revisits else np.inf
@@ -107,14 +105,14 @@ def start_odometry(system: BatchSystem) -> State:
 
 
 def length_of_lap(poses: Array, revisit: Revisit) -> float:
-    """Return the length (m) of the path of poses (P, 3) from a pose until the revisit beside it."""
+    """Length (m) of the path of poses (P, 3) from a pose to the place beside it at its revisit."""
     driven = path_lengths(poses)
     return float(driven[revisit.later] - driven[revisit.earlier] - revisit.local[0])
 
 
 @dataclass(frozen=True, eq=False)
 class AlignedOdometry:
-    """The optimum of odometry and revisits: what is known of a drive without any curve."""
+    """The optimum of odometry and revisits, without curves."""
 
     chain: LogOdometry
     revisits: Sequence[Revisit]
@@ -122,27 +120,27 @@ class AlignedOdometry:
 
     @property
     def poses(self) -> Array:
-        """Return the poses (P, 3) of all cycles."""
+        """Poses (P, 3) of all cycles."""
         return self.variables.poses
 
     @property
     def calibration(self) -> Array:
-        """Return the calibration (2,) of the odometry."""
+        """Calibration (2,) of the odometry."""
         return self.variables.calibration
 
     @cached_property
     def covariances(self) -> Array:
-        """Return the marginal covariance (P, 3, 3) of each pose."""
+        """Marginal covariance (P, 3, 3) of each pose."""
         return self.system().pose_marginals
 
     def system(self) -> Elimination:
-        """Return the linear system at the present values."""
+        """Linearize the problem at the present values."""
         rows = self.chain.rows(self.poses, self.calibration)
         rows += [one.rows(self.poses) for one in self.revisits]
         return Elimination(linear_graph(rows, self.variables), self.variables.layout)
 
     def disagreement(self, poses: Array) -> float:
-        """Return the root mean square distance of poses (P, 3) from these, in standard deviations."""
+        """Root mean square distance of poses (P, 3) from these, in standard deviations."""
         off = poses - self.poses
         square = np.einsum("ki,ki->k", off, np.linalg.solve(self.covariances, off[:, :, None])[:, :, 0])
         return float(np.sqrt(square.mean() / POSE))
@@ -151,7 +149,7 @@ class AlignedOdometry:
 def aligned_odometry(
     chain: LogOdometry, revisits: Sequence[Revisit], begin: AlignedOdometry | None = None
 ) -> AlignedOdometry:
-    """Return the optimum of odometry and revisits, by Gauss-Newton from another one or dead reckoning."""
+    """Find the optimum of odometry and revisits by Gauss-Newton, from another one or dead reckoning."""
     if begin is None:
         variables, poses = Variables(), chain.dead_reckoned(chain.calibration_mean)
         variables.insert(np.array([CALIBRATION_KEY]), chain.calibration_mean)
@@ -168,7 +166,7 @@ def aligned_odometry(
 
 
 def all_cones(judged: JudgedLog) -> DetectionColumns:
-    """Return the detections of all cones of a log, corrected by the sensor's calibration as it is known."""
+    """Detections of all cones of a log, corrected by the known calibration of the sensor."""
     pairs = zip(judged.cycles, judged.orange, strict=True)
     table = DetectionColumns.of([one.with_others(other) for one, other in pairs], twists=judged.chain.twists)
     calibration = judged.settings.calibration
@@ -177,16 +175,12 @@ def all_cones(judged: JudgedLog) -> DetectionColumns:
 
 
 def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
-    """Return the revisits of a whole drive by its cones: the first return to its beginning, and later ones.
+    """Find the revisits of a whole drive by its cones: the first return to its beginning, and later ones.
 
-    Before the first return the poses are dead reckoned, so it has to be sure. A revisit that they contradict
-    aligns them, and the next is searched for `REVISIT_INTERVAL` metres later, nearby.
+    Before the first return the poses are dead reckoned. A revisit that contradicts the poses aligns them. The
+    next one is searched `REVISIT_INTERVAL` metres later, nearby.
     """
-    chain, settings, table = judged.chain, judged.settings, all_cones(judged)
-
-    def seen_in(cycles: IntArray) -> DetectionColumns:
-        return table.where(np.flatnonzero(table.in_cycles(cycles)))
-
+    chain, settings, seen = judged.chain, judged.settings, seen_in(all_cones(judged))
     closing, reckoned = settings.closing, aligned_odometry(chain, ())
     aligned, poses = reckoned, reckoned.poses
     driven, revisits, due, lap = path_lengths(poses), list[Revisit](), closing.min_path, np.inf
@@ -197,10 +191,10 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
         so_far = poses[: newest + 1]
         if revisits:
             due = driven[newest] + REVISIT_INTERVAL / 3.0
-            revisit = _return_again(seen_in, so_far, lap, settings)
+            revisit = _return_again(seen, so_far, lap, settings)
         else:
             due = driven[newest] + closing.check_interval
-            revisit = return_to_beginning(seen_in, so_far, reckoned.covariances[newest], settings)
+            revisit = return_to_beginning(seen, so_far, reckoned.covariances[newest], settings)
         if revisit is None:
             continue
         if not revisits:
@@ -214,16 +208,16 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
 
 
 def _is_off(revisit: Revisit, poses: Array) -> bool:
-    """Return whether poses (P, 3) contradict a revisit so much that they are no place to search the next."""
+    """Whether poses (P, 3) contradict a revisit too much for the search of the next one."""
     off = relative(poses[revisit.earlier], poses[revisit.later]) - revisit.local
     off[2] = wrap_angle(off[2])
     return float(off @ NEARBY.information @ off) > OFF**2
 
 
-def _return_again(seen_in: SeenIn, poses: Array, lap: float, settings: MapperSettings) -> Revisit | None:
-    """Return the newest of poses (P, 3) in the frame of one a lap (m) before, once laps are aligned."""
+def _return_again(seen: SeenIn, poses: Array, lap: float, settings: MapperSettings) -> Revisit | None:
+    """Return the newest of poses (P, 3) in the frame of one a lap (m) before, after laps were aligned."""
     last = float(path_lengths(poses)[-1]) - LAP_SHARE * lap
-    found = find_return(seen_in, poses, last, NEARBY, settings.growth)
+    found = find_return(seen, poses, last, NEARBY, settings.growth)
     if found is None or not found[0].is_sure:
         return None
     return revisit_of(found[0], poses, found[1], len(poses) - 1)
@@ -237,9 +231,9 @@ def _begin_boundary(
     detections: DetectionTable,
     settings: MapperSettings,
 ) -> None:
-    """Add a curve through the cones of a boundary that were seen in the first lap (m), if there are enough.
+    """Add a curve through the cones of a boundary that were detected in the first lap (m), if they suffice.
 
-    A detection whose station isn't about that of its cycle belongs to a stretch that is driven later.
+    A detection far from the station of its cycle belongs to a stretch that is driven later.
     """
     driven, gate, closes = path_lengths(poses), settings.gate, bool(np.isfinite(lap))
     first_lap = driven < lap

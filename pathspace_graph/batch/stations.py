@@ -1,4 +1,4 @@
-"""Detections of a batch at the stations of its cones: which detection is of which cone, in every lap."""
+"""Matching of a batch's detections to the stations of its cones, in every lap."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,28 +17,32 @@ from pathspace_graph.spline.boundary import ahead_of
 
 from .association import ROW_CONES, cones_of_curve, feet_of_cones
 
-SIGMA_STATION: Final = 0.02  # of a cone along a curve that has a control point for each and follows it (m)
-SHIFT_BLOCK: Final = 20.0  # length of the stretches of a later lap that are shifted together (m)
-DRIVES_APART: Final = 3.0 * SHIFT_BLOCK  # added from drive to drive: no stretch or neighbour is of both (m)
-SHIFT_REACH: Final = 4.0  # most of a shift (m)
-SHIFT_STEP: Final = 0.1  # between the shifts that are tried (m)
-SIGMA_SHIFT: Final = 1.0  # standard deviation of a shift before it is known (m)
-SHIFT_STRAY: Final = 0.05  # likelihood of a detection far from any cone, by that of one at a cone
-SHIFT_APART: Final = 0.5  # difference between shifts that contradict each other (m)
-SHIFT_ODDS: Final = 20.0  # least odds of a shift against each that contradicts it
+SIGMA_STATION: Final = (
+    0.02  # standard deviation of a cone along a curve with a control point for each cone (m)
+)
+SHIFT_BLOCK: Final = 20.0  # length of the stretches of a later lap that shift together (m)
+DRIVES_APART: Final = (
+    3.0 * SHIFT_BLOCK
+)  # added between drives, so that no neighbouring stretches are of both (m)
+SHIFT_REACH: Final = 4.0  # largest shift (m)
+SHIFT_STEP: Final = 0.1  # step of the shifts (m)
+SIGMA_SHIFT: Final = 1.0  # prior standard deviation of a shift (m)
+SHIFT_STRAY: Final = 0.05  # likelihood of a detection far from any cone, relative to one at a cone
+SHIFT_APART: Final = 0.5  # least difference of contradicting shifts (m)
+SHIFT_ODDS: Final = 20.0  # least odds of a shift against each contradicting one
 
 
 @dataclass(frozen=True, eq=False)
 class StationMatches:
-    """The stations of a batch's closed curves, and the detections that are of one beyond doubt."""
+    """The stations of a batch's closed curves, and their unambiguous detections."""
 
     stations: Stations
-    rows: IntArray  # (m,) detections, by row of their table
+    rows: IntArray  # (m,) detections, by row of the table
     station: IntArray  # (m,) station of each
     sigma: Array  # (m,) standard deviations along the curve, of detection and station (m)
 
     def used(self, detections: DetectionTable) -> tuple[IntArray, IntArray, Array]:
-        """Return rows, stations and sigmas (k,) of those in use on the boundary of their station."""
+        """Return rows, stations and sigmas (k,) of detections in use on the boundary of their station."""
         on_boundary = detections.boundary[self.rows] == self.stations.label[self.station]
         chosen = detections.used[self.rows] & on_boundary
         return self.rows[chosen], self.station[chosen], self.sigma[chosen]
@@ -47,16 +51,16 @@ class StationMatches:
 def match_stations(
     state: State, detections: DetectionTable, settings: MapperSettings
 ) -> StationMatches | None:
-    """Return the cones of the first drive's first lap as stations of closed curves, with all detections.
+    """Match all detections to stations of closed curves, the cones of the first drive's first lap.
 
-    None where a curve has too few cones, or one is a line. A lap ends beside its beginning by some
-    decimetres: cones of both ends would be smeared, and those of a later lap matched with their neighbours.
-    So the first lap places them, and each stretch of a later one is shifted along the curves to where its
-    cones are. Where two shifts are about as likely, its detections are of no cone.
+    None if a curve has too few cones, or is a line. A lap misses its beginning by some decimetres, which
+    would smear the cones of both ends and match a later lap to neighbours. So the first lap places the cones,
+    and each stretch of a later lap is shifted along the curves to them. If two shifts are about as likely,
+    the detections of the stretch are not matched.
     """
-    places = {}
     if settings.lines:
         return None
+    places = {}
     for label in state.boundaries:
         first = detections.where(np.flatnonzero(laps_of(state, detections, label) <= 0)).of_drive(0)
         cones = cones_of_curve(state, first, label, settings)
@@ -78,17 +82,17 @@ def match_stations(
 
 @dataclass(frozen=True, eq=False)
 class SeenAgain:
-    """The m used detections of a closed curve's colour, and the stretch of a later lap that each is of."""
+    """The m used detections of a closed curve's colour, and the stretch of a later lap of each."""
 
     curve: CurveStations
-    rows: IntArray  # rows (m,) in the table of detections
-    u: Array  # parameters (m,) of the foot points (m)
-    sigma: Array  # standard deviations (m,) along the curve (m)
-    block: IntArray  # stretch (m,) of the way driven from which it was seen, -1 in the first lap
+    rows: IntArray  # (m,) rows in the table of detections
+    u: Array  # (m,) parameters of the foot points (m)
+    sigma: Array  # (m,) standard deviations along the curve (m)
+    block: IntArray  # (m,) stretch of the driven path at the detection, -1 in the first lap
 
     @classmethod
     def of(cls, state: State, detections: DetectionTable, curve: CurveStations) -> Self:
-        """Choose the detections in use on a curve."""
+        """Select the detections in use on a curve."""
         label = curve.label
         rows = detections.used_on(label)
         rows = rows[detections.label[rows] == label]
@@ -102,7 +106,7 @@ class SeenAgain:
 
 
 def laps_of(state: State, detections: DetectionTable, label: int) -> IntArray:
-    """Return the lap (m,) on a closed curve in which each detection's foot point was passed, from 0."""
+    """Lap (m,) on a closed curve in which each detection's foot point was passed, from 0."""
     pose_u, length = state.pose_u[label], state.boundaries[label].length
     at = pose_u[detections.cycle]
     ahead = ahead_of(at, detections.u, length)
@@ -110,10 +114,10 @@ def laps_of(state: State, detections: DetectionTable, label: int) -> IntArray:
 
 
 def shifts(seen: Sequence[SeenAgain]) -> Array:
-    """Return by how much each block (k,) of a later lap is to be shifted along the curves; nan in doubt (m).
+    """Estimate the shift (m) of each block (k,) of a later lap along the curves; NaN if ambiguous.
 
-    A shift is of the vehicle, so it is one for all curves. Its likelihood is that of the cones seen from the
-    block and its neighbours, each once, at their stations.
+    It is a shift of the vehicle, common to all curves. Its likelihood is that of the cones detected in the
+    block and its neighbours, at their stations; each cone counts once.
     """
     count = 1 + max(int(one.block.max(initial=-1)) for one in seen)
     tries = np.arange(-SHIFT_REACH, SHIFT_REACH + 0.5 * SHIFT_STEP, SHIFT_STEP)

@@ -1,4 +1,4 @@
-"""The least-squares problem of a whole log: its cost at a state, and its linear factors there."""
+"""The least-squares problem of a whole log: its cost at a state, and its linearization."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.footpoint import FootPoints, refine_joint_foot_points
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
@@ -25,30 +25,28 @@ from .association import headings
 from .stations import StationMatches, match_stations
 
 LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
-SETTLE_FEET: Final = 16  # most refinements of the foot points before a step
-SETTLED_FOOT: Final = 1e-3  # most move of a foot point that has arrived (m along the curve)
-SIGMA_SLIDE: Final = 2.0
-"""Standard deviation of a control point's slide along its curve from beside its first pose (m), where
-stations hold it there."""
+SETTLE_FEET: Final = 16  # largest number of refinements of the foot points before a step
+SETTLED_FOOT: Final = 1e-3  # largest move of a converged foot point (m along the curve)
+SIGMA_SLIDE: Final = 2.0  # standard deviation of a control point's slide along a curve with stations (m)
 
 
 @dataclass(frozen=True, eq=False)
 class CurveGauge:
     """The residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` of a curve's control points c_j.
 
-    p_k is the position of the pose that control point c_j began beside, and h_k its heading. Detections
-    constrain nothing along a curve, so control points would slide along it; held beside a pose they don't,
-    and the map is as free as before.
+    p_k and h_k are position and heading of the pose beside which c_j began. Detections do not constrain the
+    control points along the curve, so they would slide. The gauge keeps them beside a pose, and leaves the
+    map free.
     """
 
     label: int
-    keys: IntArray  # keys (m,) of the control points
-    cycle: IntArray  # perception cycles (m,) of the poses beside them
-    ahead: Array  # distances (m,) of the control points ahead of their poses (m)
+    keys: IntArray  # (m,) keys of the control points
+    cycle: IntArray  # (m,) perception cycles of the poses beside them
+    ahead: Array  # (m,) distances of the control points ahead of their poses (m)
     sigma: float  # standard deviation of that distance (m)
 
     def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
-        """Return whitened residuals (m,) of control points (m, 2) beside poses (m, 3), and derivatives."""
+        """Linearize whitened residuals (m,) of control points (m, 2) beside poses (m, 3)."""
         heading = headings(beside) / self.sigma
         arm = control_points - beside[:, :2]
         by_theta = heading[:, 0] * arm[:, 1] - heading[:, 1] * arm[:, 0]
@@ -56,7 +54,7 @@ class CurveGauge:
         return residual, heading, np.column_stack([-heading, by_theta])
 
     def rows(self, control_points: Array, poses: Array) -> Rows:
-        """Return `terms` as rows on [control point | pose], from all poses (P, 3)."""
+        """Rows of `terms` on [control point | pose], given all poses (P, 3)."""
         residual, by_point, by_pose = self.terms(control_points, poses[self.cycle])
         jacobian = np.column_stack([by_point, by_pose])
         return Rows(self._keys_beside, jacobian, residual, owners(self.cycle, self.label))
@@ -66,9 +64,9 @@ class CurveGauge:
         return np.column_stack([self.keys, pose_keys(self.cycle)])
 
     def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
-        """Return rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
+        """Rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
 
-        They damp (1/m^2) how it moves as seen from the pose beside it, not a map that swings with its poses.
+        They damp (1/m^2) motion relative to the pose beside it, but not a rotation of the map with its poses.
         """
         arm = control_points - poses[self.cycle, :2]
         by_point, by_theta = np.tile(np.eye(POINT), (len(arm), 1)), np.column_stack([arm[:, 1], -arm[:, 0]])
@@ -80,13 +78,13 @@ class CurveGauge:
         )
 
     def carried(self, control_points: Array, poses: Array, poses_after: Array) -> Array:
-        """Return control points (m, 2) moved rigidly with the poses beside them, from and to (P, 3)."""
+        """Move control points (m, 2) rigidly with the poses beside them, from and to (P, 3)."""
         before, after = poses[self.cycle], poses_after[self.cycle]
         return after[:, :2] + turned(control_points - before[:, :2], after[:, 2] - before[:, 2])
 
 
 def curve_gauge(state: State, label: int, sigma: float, until: int | None = None) -> CurveGauge:
-    """Return the gauge that holds each control point where it is, beside a pose of a cycle before `until`."""
+    """Build the gauge of the present control points, beside poses of cycles before `until`."""
     control_points, cycle = state.control_points(label), _nearest_poses(state, label, until)
     beside = state.poses[cycle]
     ahead = (headings(beside) * (control_points - beside[:, :2])).sum(axis=1)
@@ -94,10 +92,10 @@ def curve_gauge(state: State, label: int, sigma: float, until: int | None = None
 
 
 def _nearest_poses(state: State, label: int, until: int | None) -> IntArray:
-    """Return (m,) the pose nearest to where each control point acts, of those with the curve's direction.
+    """Find the pose (m,) in the curve's direction nearest to the point where each control point acts.
 
-    On an open curve, which may have drifted over itself, it is within the mean distance of control points of
-    the nearest along it.
+    On an open curve, which may have drifted over itself, its parameter is within the mean distance of control
+    points of the nearest parameter.
     """
     boundary, points, poses = state.boundaries[label], state.control_points(label), state.poses[:until]
     u = boundary.abscissae
@@ -115,19 +113,19 @@ def _nearest_poses(state: State, label: int, until: int | None) -> IntArray:
 
 @dataclass(frozen=True)
 class Biweight:
-    """Tukey's robust loss `rho(z) = g^2 / 6 (1 - (1 - z^2 / g^2)^3)`, which is constant beyond the gate g.
+    """Tukey's biweight loss `rho(z) = g^2 / 6 (1 - (1 - z^2 / g^2)^3)`, constant beyond the gate g.
 
-    A detection at the gate has no weight, so nothing moves when one more or one less is used.
+    A detection at the gate has no weight, so using one more or less moves nothing.
     """
 
     gate: float  # gate g in sigmas
 
     def loss(self, whitened: Array) -> Array:
-        """Return `rho(z)` (m,) of whitened residuals z (m,)."""
+        """Loss `rho(z)` (m,) of whitened residuals z (m,)."""
         return np.asarray(self.gate**2 / 6.0 * (1.0 - self._inner(whitened) ** 3))
 
     def weights(self, whitened: Array) -> Array:
-        """Return the robust weights `rho'(z) / z = (1 - z^2 / g^2)^2` (m,)."""
+        """Robust weights `rho'(z) / z = (1 - z^2 / g^2)^2` (m,)."""
         return np.asarray(self._inner(whitened) ** 2)
 
     def _inner(self, whitened: Array) -> Array:
@@ -136,10 +134,10 @@ class Biweight:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Problem at one state."""
+    """The problem at one state."""
 
     state: State
-    across: DetectionRows  # used detections across the curves; those beyond an end say nothing
+    across: DetectionRows  # used detections across the curves; infinite sigma beyond an end
     u: Array  # (m,) parameters of their foot points (m)
     along: DetectionRows  # used detections at their stations
     drive: list[Rows]  # rows of odometry, priors and revisits
@@ -160,39 +158,40 @@ class BatchSystem:
         self.detections = detections
         self.chain = chain
         self.settings = settings
-        self.revisits = tuple(revisits)  # where the road was driven twice
-        self.factors = by_widths(factors)  # of the user's factors, at values of zero
+        self.priors = [settings]  # settings of each drive, for the priors of its calibrations
+        self.revisits = tuple(revisits)  # relative poses of cycles on the same road
+        self.factors = by_widths(factors)  # the user's factors, at values of zero
         self.kernel = Biweight(LOOSE_GATE)
         self.gauges: dict[int, CurveGauge] = {}  # of each boundary
-        self.matches: StationMatches | None = None  # cones of closed curves, where they hold detections
+        self.matches: StationMatches | None = None  # stations of closed curves, if they are used
         self._sigma = np.ones(len(detections))  # across the curves, of this round (m)
 
-    def widen_priors(self, settings: MapperSettings) -> None:
-        """Take the priors of the calibrations from other settings."""
-        self.settings = settings
+    def widen_priors(self, drive: int, settings: MapperSettings) -> None:
+        """Take the priors of a drive's calibrations from other settings."""
+        self.settings = self.priors[drive] = settings
         self.chain = replace(self.chain, calibration_sigma=np.array(settings.odometry.sigmas))
 
     def begin(self, state: State, stations: bool = False) -> None:
-        """Make the gauges anew, which hold the control points where they are now, when knots have changed.
+        """Rebuild the gauges at the present control points, after knots have changed.
 
-        With `stations`, the detections in use are matched with the cones of closed curves.
+        With `stations`, the used detections are matched to the cones of closed curves.
         """
         self.matches = match_stations(state, self.detections, self.settings) if stations else None
         self.gauges = {label: curve_gauge(state, label, self.sigma_slide) for label in state.boundaries}
 
     @property
     def sigma_slide(self) -> float:
-        """Return the standard deviation of a control point's slide along its curve (m)."""
+        """Standard deviation of a control point's slide along its curve (m)."""
         return SIGMA_SLIDE if self.matches else self.settings.batch.sigma_slide
 
     def drive_rows(self, state: State) -> list[Rows]:
-        """Return the rows of odometry, and of the priors of the first pose and the calibrations."""
+        """Rows of odometry, and of the priors of the first pose and the calibrations."""
         return self.chain.rows_at(state.variables, self.settings.calibration)
 
     def evaluate(self, state: State, hold: bool = False) -> Evaluation:
-        """Return the problem at a state; foot points are refined from those that the detections have.
+        """Evaluate the problem at a state; foot points are refined from the parameters of the detections.
 
-        `hold` sets what later evaluations keep. That the sigma depends on the curve's direction has no
+        `hold` fixes the sigmas for later evaluations. Their dependence on the curve's direction has no
         derivative.
         """
         drive = self.drive_rows(state) + [one.rows(state.poses) for one in self.revisits]
@@ -206,10 +205,10 @@ class BatchSystem:
         return Evaluation(state, across, u, along, drive, cost)
 
     def _across(self, state: State, hold: bool) -> tuple[DetectionRows, Array]:
-        """Return the used detections across the curves, and the parameters (m,) of their foot points.
+        """Linearize used detections across the curves; return them and the foot points' parameters (m,).
 
-        A round holds the sigmas, and whether a foot point is inside its curve: the cost does not jump where
-        an open end slides past a detection.
+        Sigmas are fixed during a round, and so is whether a foot point is interior. So the cost does not jump
+        when an open end slides past a detection.
         """
         detections = self.detections
         rows = np.flatnonzero(detections.used)
@@ -221,17 +220,16 @@ class BatchSystem:
         return replace(seen, sigma=self._sigma[rows]), foot.u
 
     def _feet(self, state: State, rows: IntArray, points: Array) -> FootPoints:
-        """Return the foot points of used detections (m,) at points (m, 2), from those that they have on."""
+        """Refine the foot points of used detections (m,) at points (m, 2)."""
         detections, curves = self.detections, state.curves
         u, s = detections.u[rows], curves.boundaries[0].settings
         curve = curves.labels.searchsorted(detections.boundary[rows])
         stretch = u, u - s.refine_room, np.minimum(u + s.refine_room, curves.trusted[curve])
-        return refine_joint_foot_points(
-            curves.searched, state.map_points, points, curve, *stretch, s.refine_iterations
-        )
+        search = *stretch, s.refine_iterations
+        return FootPoints(*curves.searched.refine(state.map_points, points, curve, *search))
 
     def settle(self, state: State) -> None:
-        """Refine the foot points of the used detections until they stay."""
+        """Refine the foot points of the used detections until they converge."""
         detections, rows = self.detections, np.flatnonzero(self.detections.used)
         for _ in range(SETTLE_FEET if state.boundaries else 0):
             before = detections.u[rows]
@@ -242,12 +240,12 @@ class BatchSystem:
                 break
 
     def _along(self, state: State, matches: StationMatches) -> DetectionRows:
-        """Return the matched detections that are in use, with the sigmas that they were matched by."""
+        """Linearize the used detections at their stations, with the sigmas of the matching."""
         rows, station, sigma = matches.used(self.detections)
         return replace(matches.stations.rows(state, self.detections, rows, station, sigma), sigma=sigma)
 
     def rows(self, at: Evaluation, gauges: Mapping[int, CurveGauge] | None = None) -> list[Rows]:
-        """Return every whitened row of Gauss-Newton at a state; those of detections have robust weights."""
+        """All whitened rows of Gauss-Newton at a state; rows of detections have robust weights."""
         groups = [*at.drive]
         for seen in (at.along, at.across):
             owner = owners(self.detections.cycle[seen.rows], self.detections.boundary[seen.rows])
@@ -255,29 +253,29 @@ class BatchSystem:
         return groups + self._priors(at.state, gauges or self.gauges)
 
     def _priors(self, state: State, gauges: Mapping[int, CurveGauge]) -> list[Rows]:
-        """Return the weak priors: the gauges, and as online the smoothness and anchors of control points."""
+        """Rows of the weak priors: gauges, and as online smoothness and anchors of control points."""
         beside = [gauge.rows(state.control_points(label), state.poses) for label, gauge in gauges.items()]
         on_points = CurveMap(self.settings, state).linear_gauge(whole=True)
         return beside + [replace(rows, owner=-1 - rows.owner) for rows in on_points]
 
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
-        """Return all rows as a linear graph, whose solution is the change from the state."""
+        """Linear graph of all rows; its solution is the change from the state."""
         return linear_graph(self.rows(at), at.state.variables)
 
     def eliminated(self, at: Evaluation) -> Elimination:
-        """Return the linear problem with its poses eliminated."""
+        """Linear problem with its poses eliminated."""
         return Elimination(self.linear_graph(at), at.state.variables.layout)
 
     def damping(self, state: State, weight: float) -> list[Rows]:
-        """Return rows that damp how control points move as seen from the poses beside them (1/m^2)."""
+        """Rows that damp the motion of control points relative to the poses beside them (1/m^2)."""
         points, poses = state.control_points, state.poses
         return [gauge.damping(points(label), poses, weight) for label, gauge in self.gauges.items()]
 
     def retract(self, state: State, step: Array) -> State:
-        """Return the state after a step (n,), taken in relative coordinates.
+        """Return the state after a step (n,) in relative coordinates.
 
-        Poses change as seen from the pose before, and control points as seen from the pose beside them. So a
-        map that swings by a large angle keeps its shape.
+        A pose changes relative to the pose before, a control point relative to the pose beside it. So the map
+        keeps its shape in a rotation by a large angle.
         """
         linear = moved(state, step)
         after, poses, goal = linear.copy(), state.poses, linear.poses
@@ -292,21 +290,21 @@ class BatchSystem:
         return after
 
     def poses_alone(self, at: Evaluation) -> Array:
-        """Return the step (3 P,) of the poses while the map and the calibration are held."""
+        """Step (3 P,) of the poses with fixed map and calibration."""
         keys = at.state.variables.keys
         graph = linear_graph(fix_map(self.rows(at)), at.state.variables)
         return Elimination(graph, Layout(keys[are_poses(keys)])).poses_given(np.zeros(0))
 
 
 def seen_from(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
-    """Return points (m, 2), map frame, in the frames of poses (m, 3) after a step, to first order."""
+    """Transform points (m, 2), map frame, to the frames of poses (m, 3) after a step, to first order."""
     arm, change = points - poses[:, :2], points_after - points - poses_after[:, :2] + poses[:, :2]
     turn = (poses_after[:, 2] - poses[:, 2])[:, None]
     return turned(arm + change + turn * np.column_stack([arm[:, 1], -arm[:, 0]]), -poses[:, 2])
 
 
 def turned(vectors: Array, angles: Array) -> Array:
-    """Return vectors (m, 2), each turned by its angle (m,) in rad."""
+    """Rotate vectors (m, 2), each by its angle (m,) in rad."""
     return to_map(vectors, np.column_stack([np.zeros((len(angles), 2)), angles]))
 
 

@@ -1,7 +1,7 @@
 """Rows of cones: both boundaries of the road ahead, followed from cone to cone.
 
-Where colours tell which row a cone is of, the rows are extended in turn (`extend_rows`). Cones without a
-colour are dealt out to both rows, as long as it is clear which comes next (`deal_out`).
+`extend_rows` extends rows of known colours in turn. `deal_out` assigns cones without a colour to both rows
+until the next cone is ambiguous.
 """
 
 from collections.abc import Sequence
@@ -17,33 +17,33 @@ from pathspace_graph.mapping.path import along_and_across, crosses
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a row from one cone to the next, whose cost is `distance (1 + turn_cost turn^2)`."""
+    """Limits of a step from one cone of a row to the next; its cost is `distance (1 + turn_cost turn^2)`."""
 
     gap: float  # largest distance of neighbours (m)
-    turn: float  # largest turn from one cone to the next where both coincide (rad)
-    turn_rate: float  # decrease of that turn with the distance to the next cone (rad/m)
+    turn: float  # largest turn at distance 0 (rad)
+    turn_rate: float  # decrease of the largest turn with distance (rad/m)
     turn_cost: float  # cost of a turn (rad^-2)
     width: float  # least distance from the other row (m)
 
 
 EXTENDED: Final = Limits(gap=11.0, turn=2.0, turn_rate=0.1, turn_cost=1.0, width=1.5)
-"""Limits of rows of known colours: two regular gaps, as one cone may be missed."""
+"""Limits of rows of known colours: two regular gaps, since one cone may be missed."""
 DEALT_OUT: Final = Limits(gap=8.0, turn=1.3, turn_rate=0.0, turn_cost=2.0, width=1.8)
-WIDTH_RATIO: Final = 1.8  # largest ratio of successive cones' distances from the other boundary
-WIDTH_SLACK: Final = 1.0  # further growth allowed of that distance (m)
-CLEAR: Final = 1.3  # least cost of the next cone of a row in the other row, by its own cost
+WIDTH_RATIO: Final = 1.8  # largest growth of the distance from the other row between successive cones
+WIDTH_SLACK: Final = 1.0  # additional growth allowed (m)
+CLEAR: Final = 1.3  # least ratio of a cone's cost in the other row to its cost in its own
 
 
 @dataclass(eq=False)
 class ConeRow:
-    """One boundary as far as it is known, and the cones that may continue it."""
+    """The known part of a boundary, and the cones that may continue it."""
 
-    side: float  # sign of the signed distance from the other row (left positive)
+    side: float  # side of the other row on which it lies: 1 left, -1 right
     line: Array  # (n, 2) points of the row in driving order (m)
-    direction: Array  # (2,) unit vector in which the row leads on from its last point
+    direction: Array  # (2,) unit vector along the row at its last point
     candidates: Array  # (k, 2) cones that may continue the row (m)
-    chosen: list[int] = field(default_factory=list)  # candidates taken, in order
-    ended: bool = False  # whether no candidate continues the row, wherever the other one leads
+    chosen: list[int] = field(default_factory=list)  # indices of the candidates in the row, in order
+    ended: bool = False  # whether no candidate can continue the row
 
     @property
     def end(self) -> Array:
@@ -51,12 +51,12 @@ class ConeRow:
 
     @property
     def cones(self) -> Array:
-        """Return the candidates (c, 2) that the row leads through."""
+        """Return the candidates (c, 2) in the row."""
         return self.candidates[self.chosen]
 
     @property
     def lengths(self) -> Array:
-        """Return the lengths (c,) in m along the row from the known end to the cones that continue it."""
+        """Return the lengths (c,) in m along the row from the known end to each chosen candidate."""
         return path_lengths(self.line[-len(self.chosen) - 1 :])[1:]
 
     def choose(self, index: int) -> None:
@@ -67,7 +67,7 @@ class ConeRow:
         self.chosen.append(index)
 
     def costs(self, indices: IntArray, limits: Limits) -> tuple[Array, Array]:
-        """Return distances (m) of candidates (k,) and their costs, infinite for too large a turn."""
+        """Return distances (k,) in m and costs (k,) of candidates, infinite beyond the largest turn."""
         step = self.candidates[indices] - self.end
         distance, (cos, sin) = np.hypot(step[:, 0], step[:, 1]), self.direction
         turn = np.abs(np.arctan2(cos * step[:, 1] - sin * step[:, 0], step @ self.direction))
@@ -75,9 +75,9 @@ class ConeRow:
         return distance, np.where(turn < limits.turn - limits.turn_rate * distance, cost, np.inf)
 
     def choose_next(self, other: "ConeRow", driven: Array, threshold: float) -> bool:
-        """Continue the row through the candidate that `extend_rows` allows; return whether there is one.
+        """Continue the row by the rules of `extend_rows`; return whether there is a candidate.
 
-        The row has ended where no candidate continues it wherever the other one leads.
+        A row without any candidate within the limits has `ended`.
         """
         distance, cost = self.costs(np.arange(len(self.candidates)), EXTENDED)
         possible = (distance > threshold) & (distance < EXTENDED.gap) & np.isfinite(cost)
@@ -96,10 +96,10 @@ class ConeRow:
 
 
 def extend_rows(left: ConeRow, right: ConeRow, driven: Array, threshold: float) -> None:
-    """Continue both rows through their candidates, each time the one that lags behind.
+    """Continue both rows through their candidates, always the row that lags behind.
 
-    A row stays on its side of the other, at about the width of the track, and does not cross the driven path
-    (n, 2). A cone nearer to a row's end than `threshold` (m) is passed over.
+    A row stays on its side of the other one, at about the width of the track, and does not cross the driven
+    path (n, 2). Cones within `threshold` (m) of a row's end are skipped.
     """
     waiting = [left, right]
     while waiting:
@@ -112,7 +112,7 @@ def extend_rows(left: ConeRow, right: ConeRow, driven: Array, threshold: float) 
 
 
 def _has_width(row: ConeRow, other: ConeRow, points: Array) -> BoolArray:
-    """Return whether points (k, 2) are about as far from the other row as the end of their own row."""
+    """Whether points (k, 2) are about as far from the other row as the end of their own row."""
     stations = path_lengths(other.line)
     station, width = along_and_across(np.concatenate([row.end[None], points]), other.line, stations)
     width, beyond = row.side * width, station[1:] > stations[-1]
@@ -121,10 +121,10 @@ def _has_width(row: ConeRow, other: ConeRow, points: Array) -> BoolArray:
 
 
 def deal_out(rows: Sequence[ConeRow], free: IntArray, may_be: BoolArray) -> None:
-    """Lead two rows on through free cones (k,), as long as it is clear which cone comes next.
+    """Continue two rows through free cones (k,), given by index, until the next cone is ambiguous.
 
-    The next one, of those that a row may have by `may_be` (2, k), costs its row least, and the other one far
-    more. Both rows have the same candidates.
+    The next cone has the least cost of all that `may_be` (2, k) allows a row, and a cost `CLEAR` times as
+    large in the other row. Both rows have the same candidates.
     """
     while len(free):
         ways = [row.costs(free, DEALT_OUT) for row in rows]
@@ -139,6 +139,6 @@ def deal_out(rows: Sequence[ConeRow], free: IntArray, may_be: BoolArray) -> None
 
 
 def _distances(points: Array, cones: Array) -> Array:
-    """Return the distance (k,) of each point (k, 2) from the nearest of cones (n, 2), infinite for none."""
+    """Return the distance (k,) of each point (k, 2) from the nearest cone (n, 2), infinite without any."""
     off = points[:, None] - cones[None]
     return np.asarray(np.hypot(off[..., 0], off[..., 1]).min(axis=1, initial=np.inf))

@@ -1,13 +1,13 @@
-"""The front end of all estimators: what they are given of each cycle."""
+"""The front end of all estimators: it checks the readings of each cycle and assigns their noise."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
@@ -27,41 +27,41 @@ from .noise import NoiseLearner, measure
 from .sides import SideJudge
 from .sightings import SeenCycle, TwistRecord
 
-SWAPPED: Final = {  # notices that the colours are swapped from now on, or no longer
+SWAPPED: Final = {  # notices of the cycle in which colours become swapped, or no longer are
     True: "the cones on the left have the colour of the right boundary: the colours are swapped, the track "
     "is driven the other way round, or y points to the right in the whole log",
-    False: "the colours are as they were said to be",
+    False: "the colours are on the stated sides",
 }
-COLOURLESS: Final = {  # notices that most colours are unknown from now on, or no longer
-    True: "most detections have no colour: the way driven tells their sides",
+COLOURLESS: Final = {  # notices of the cycle in which most colours become unknown, or no longer are
+    True: "most detections have no colour: the driven path determines their sides",
     False: "most detections have a colour again",
 }
 OF_LINES: Final = (
-    "the detections are points of a line, mapped as cones: begin again with `kind` of the settings as {!r}"
+    "the detections are points of a line but are mapped as cones: start again with the setting `kind` = {!r}"
 )
-NEAREST: Final = 2  # number of nearest cones that are orange where the vehicle drives between orange cones
+NEAREST: Final = 2  # number of nearest cones that must be orange in a lane of orange cones
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Readings of a cycle after they were judged."""
+    """Checked readings of a cycle."""
 
-    motion: MeasuredMotion  # motion that leads to the cycle
-    detections: Detections  # detections of cones that bound the road
-    seen_again: BoolArray  # (m,) whether each of them lies where the cycles just before had one
-    orange: Detections  # detections of orange cones, which bound no road
-    stated: tuple[Detections, Detections]  # those of both kinds as they came, before any noise was measured
-    noise: NoiseLearner  # noise as it is known now
+    motion: MeasuredMotion  # motion from the previous cycle to this one
+    detections: Detections  # detections of boundary cones, with labels and covariances for the map
+    seen_again: BoolArray  # (m,) whether the previous cycles had a detection at the same place
+    orange: Detections  # detections of orange cones, which belong to no boundary
+    stated: tuple[Detections, Detections]  # both kinds of detections with their stated covariances
+    noise: NoiseLearner  # noise known so far
     sensor_doubted: bool = False  # whether readings contradict the prior of the sensor's yaw or latency
-    measured: MapperSettings | None = None  # with priors of calibrations that were measured in this cycle
-    notice: str = ""  # what the labels mean from now on, where that has changed
+    measured: MapperSettings | None = None  # settings with calibration priors measured in this cycle
+    notice: str = ""  # change of the meaning of the labels
 
 
-class FrontEnd:
-    """Judge of each cycle's readings by those of the cycles before, without any map."""
+class FrontEnd(Copyable):
+    """Checks of each cycle's readings against the previous cycles, without a map."""
 
     def __init__(self, settings: MapperSettings, noise: KnownNoise, scale: float = 1.0) -> None:
-        """Begin with the noise known at scale 1; cycles come in metres of a scene of the scale."""
+        """Start with the noise known at scale 1; lengths of the cycles are divided by `scale`."""
         self.noise = NoiseLearner(noise, settings.noise, of_lines=settings.kind == "line")
         self.gate = Gate(settings.limits, scale)
         self._motion = MotionCheck(self.noise.twist_sigma, settings.motion)
@@ -70,38 +70,44 @@ class FrontEnd:
         self._sides = SideJudge(settings.sides)
         self._kind = None if settings.kind else KindJudge()  # until the kind is known
 
-    def copy(self) -> Self:
-        """Return a copy that goes on independently, and shares what nothing changes."""
-        other = shallow(self)
-        other.noise, other.gate = self.noise.copy(), self.gate.copy()
-        other._motion, other._sides = self._motion.copy(), self._sides.copy()
-        other._kind = self._kind and self._kind.copy()
-        return other
-
     def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
-        """Return a usable cycle, or raise a ReadingError."""
+        """Return the cycle at scale 1; raise a ReadingError if it is unusable."""
         return self.gate.admit(odometry, detections, self._motion.newest)
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
-        """Return the judged readings of a cycle: the twists since the last one, and its detections."""
-        noise, check, sides = self.noise, self._motion, self._sides
-        of_orange = is_orange(detections)
-        cones, orange = detections.where(~of_orange), detections.where(of_orange)
-        cones = merged(cones, of_line(cones.labels, self._settings))
+        """Check the readings of a cycle: the twists since the previous one, and its detections."""
+        noise, check = self.noise, self._motion
+        cones, orange, is_line, in_lane = split_detections(detections, self._settings)
         checked = noise.for_check(cones, odometry.twist[-1] if len(odometry.t) else np.zeros(3))
-        is_line = of_line(cones.labels, self._settings)
         motion = check.update(odometry, checked, noise.is_settled, is_line)
+        cones, notices = self._labelled(cones, checked, motion, in_lane=in_lane)
+        notices += self._found_kind(odometry, cones)
+        for_map, orange_for_map = noise.for_map(cones), noise.for_map(orange)
+        measured = self._measured(odometry, cones, motion)
+        doubted, notice = self._sensor_doubted, "; ".join(notices)
+        stated = cones, orange
+        return Reading(
+            motion, for_map, check.seen_again, orange_for_map, stated, noise, doubted, measured, notice
+        )
+
+    def _labelled(
+        self, cones: Detections, checked: Detections, motion: MeasuredMotion, *, in_lane: bool
+    ) -> tuple[Detections, list[str]]:
+        """Label cones by their sides, and return notices if the meaning of the colours changes."""
+        sides = self._sides
         swapped, colourless = sides.swapped, sides.colourless
-        in_lane = is_in_orange_lane(detections, of_orange)
-        labels = sides.update(check.pose, motion.twists, checked, in_lane=in_lane).labels
+        labels = sides.update(self._motion.pose, motion.twists, checked, in_lane=in_lane).labels
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
-        cones = replace(cones, labels=labels)
-        notices += self._found_kind(odometry, cones)
-        stated = cones, orange
-        judged, orange = noise.for_map(cones), noise.for_map(orange)
-        # measured noise comes with measured errors of the sensor, by which `calibrated` judges its prior
+        return replace(cones, labels=labels), notices
+
+    def _measured(
+        self, odometry: Odometry, cones: Detections, motion: MeasuredMotion
+    ) -> MapperSettings | None:
+        """Measure noise and errors of the sensor; return settings with new priors of the calibrations."""
+        noise, check = self.noise, self._motion
         settings, calibration = self._settings, self._settings.calibration
+        # measured noise includes measured errors of the sensor, and `calibrated` checks its prior with them
         may_doubt = not (self._sensor_doubted or noise.of_detections)
         if may_doubt and check.errors.contradict(calibration):
             self._sensor_doubted = True
@@ -111,12 +117,10 @@ class FrontEnd:
             check.set_noise(noise.twist_sigma)
         if fresh or not self._begun:
             settings, self._begun = noise.calibrated(self._settings), True
-        measured = None if settings is self._settings else settings
-        seen, notice = check.seen_again, "; ".join(notices)
-        return Reading(motion, judged, seen, orange, stated, noise, self._sensor_doubted, measured, notice)
+        return None if settings is self._settings else settings
 
     def _found_kind(self, odometry: Odometry, cones: Detections) -> list[str]:
-        """Return a notice where detections that are taken for cones turn out to be of a line."""
+        """Return a notice if detections mapped as cones turn out to be points of a line."""
         if self._kind is None:
             return []
         self._kind.see(odometry, cones)
@@ -137,17 +141,17 @@ class FrontEnd:
 
 @dataclass(frozen=True, eq=False)
 class JudgedLog:
-    """Readings of a whole log after they were judged cycle by cycle."""
+    """Checked readings of a whole log."""
 
     chain: LogOdometry  # motion from each cycle to the next
-    cycles: Sequence[Detections]
-    orange: Sequence[Detections]  # those of orange cones
-    settings: MapperSettings  # settings, with wide priors of the sensor where the readings contradict them
+    cycles: Sequence[Detections]  # detections of boundary cones
+    orange: Sequence[Detections]  # detections of orange cones
+    settings: MapperSettings  # settings, with wide sensor priors where the readings contradict them
     noise: RunNoise
 
 
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
-    """Return a log of scale 1 as the front end gives it to a batch; unknown noise is measured on it first."""
+    """Check a log at scale 1 for a batch; unknown noise is measured on the whole log first."""
     front_end = FrontEnd(settings, noise)
     if front_end.noise.is_learning:
         front_end = FrontEnd(settings, replace(noise, measured=measure_log(log, settings)))
@@ -162,14 +166,28 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
 
 
 def measurable(detections: Detections, settings: MapperSettings) -> Detections:
-    """Return the detections that noise is measured on: the cones, or points of lines where all are."""
+    """Return the detections for noise measurement: cones, or points of lines if the log has no cones."""
     if settings.kind == "line":
         return detections
     return detections.where(~of_line(detections.labels, settings))
 
 
+def split_detections(
+    detections: Detections, settings: MapperSettings
+) -> tuple[Detections, Detections, BoolArray, bool]:
+    """Split detections into boundary cones (m) and orange ones.
+
+    The others are whether each boundary cone is a point of a line (m,), and `is_in_orange_lane`.
+    """
+    of_orange = is_orange(detections)
+    cones = detections.where(~of_orange)
+    cones = merged(cones, of_line(cones.labels, settings))
+    is_line = of_line(cones.labels, settings)
+    return cones, detections.where(of_orange), is_line, is_in_orange_lane(detections, of_orange)
+
+
 def is_in_orange_lane(detections: Detections, of_orange: BoolArray) -> bool:
-    """Return whether the nearest cones are orange: the vehicle comes to a track, or is at a gate."""
+    """Whether the nearest cones are orange: the vehicle drives to the track, or is at a gate."""
     if of_orange.sum() < NEAREST:
         return False
     nearest = np.argsort(np.hypot(*detections.points_vehicle.T), kind="stable")[:NEAREST]
@@ -181,16 +199,16 @@ def is_orange(detections: Detections) -> BoolArray:
 
 
 def measure_log(log: Log, settings: MapperSettings | None = None) -> MeasuredNoise | None:
-    """Return the noise of a whole log and the constant errors of its sensor, by its readings alone.
+    """Measure the noise of a whole log and the constant errors of its sensor from its readings alone.
 
-    The settings say which detections are points of lines.
+    `settings.kind` and `settings.lines` select the detections that are points of lines.
     """
     settings = settings or MapperSettings()
     return measure(*seen_cycles(log, settings), of_lines=settings.kind == "line")
 
 
 def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[SeenCycle], TwistRecord]:
-    """Return the cones of a log where odometry alone, which is not doubted, places them, and the twists."""
+    """Return the detections of a log with poses by odometry alone, and its twists; odometry is trusted."""
     settings = settings or MapperSettings()
     readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
     for odometry, _ in readings:
@@ -199,10 +217,7 @@ def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[
     sigma = log.odometry_sigma if white is None else white.twist_sigma
     check, sides = MotionCheck(sigma, settings.motion), SideJudge(settings.sides)
     for odometry, detections in readings:
-        of_orange = is_orange(detections)
-        cones, in_lane = detections.where(~of_orange), is_in_orange_lane(detections, of_orange)
-        cones = merged(cones, of_line(cones.labels, settings))
-        is_line = of_line(cones.labels, settings)
+        cones, _, is_line, in_lane = split_detections(detections, settings)
         motion = check.update(odometry, cones, may_doubt=None, is_line=is_line)
         labelled = sides.update(check.pose, motion.twists, cones, in_lane=in_lane)
         cycles.append(SeenCycle(measurable(labelled, settings), check.pose, motion.odometry.twist))

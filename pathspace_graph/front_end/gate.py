@@ -1,19 +1,19 @@
-"""The gate of the online estimators: a perception cycle is checked before anything is touched.
+"""The gate of the online estimators: it checks a perception cycle before the estimate changes.
 
-A wrong stamp, shape, label or twist makes the whole cycle useless, which is a ReadingError and changes
-nothing. A single detection that is impossible is dropped: a detector may fail for one cone.
-A cycle comes in metres of its scene and leaves the gate at scale 1; its result goes back by the scale.
+A wrong stamp, shape, label or twist makes the whole cycle unusable: a ReadingError is raised and nothing
+changes. An impossible detection is dropped, since a detector may fail for a single cone. The gate divides
+lengths by the scale of the scene, and `Admitted.counted` multiplies those of the result by it.
 """
 
 from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.errors import InputError, ReadingError
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
@@ -34,40 +34,40 @@ from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.online import LimitSettings
 
 TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
-LATEST_STAMP: Final = 1e11  # largest stamp, s: some three thousand years. Stamps in nanoseconds are larger
-IN_SECONDS: Final = "stamps are in seconds"  # hint where one looks like one in milli- or nanoseconds
+LATEST_STAMP: Final = 1e11  # largest stamp (s), 3000 years: stamps in nanoseconds are larger
+IN_SECONDS: Final = "stamps are in seconds"  # hint for stamps in milli- or nanoseconds
 STAMPS: Final = f"at most {LATEST_STAMP:g} s ({IN_SECONDS})"
-MAX_TWISTS: Final = 100_000
-MOST_DETECTIONS: Final = 500  # largest numbers of twists and detections in a cycle, which bound its time
-MIN_RANGE: Final = 0.01  # least distance of a detection from the vehicle, m
-MIN_SIGMA: Final = 1e-6
-MAX_SIGMA: Final = 100.0  # least and largest standard deviation of a detection in any direction, m
-MIN_DETERMINANT: Final = 1e-12  # least det of a covariance over xx * yy: singular to doubles below
-MOST_ASYMMETRY: Final = 1e-6  # largest |xy - yx| of a covariance by its larger eigenvalue
+MAX_TWISTS: Final = 100_000  # largest number of twists in a cycle, which bounds its time
+MOST_DETECTIONS: Final = 500  # largest number of detections in a cycle, which bounds its time
+MIN_RANGE: Final = 0.01  # least distance of a detection from the vehicle (m)
+MIN_SIGMA: Final = 1e-6  # least standard deviation of a detection in any direction (m)
+MAX_SIGMA: Final = 100.0  # largest standard deviation of a detection in any direction (m)
+MIN_DETERMINANT: Final = 1e-12  # least det / (xx yy) of a covariance: below, doubles cannot invert it
+MOST_ASYMMETRY: Final = 1e-6  # largest |xy - yx| of a covariance over its larger eigenvalue
 _KNOWN_LABELS: Final = "one of " + ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
 
 
 @dataclass(frozen=True, eq=False)
 class Newest:
-    """Stamp and twist of the newest cycle in order; None before the first one."""
+    """Stamp and twist of the newest admitted cycle; None before the first one."""
 
-    t: float | None = None  # stamp, s
-    twist: Array | None = None  # (3,) twist that was measured last, m/s, m/s and rad/s
+    t: float | None = None  # stamp (s)
+    twist: Array | None = None  # (3,) newest measured twist (m/s, m/s, rad/s)
 
 
 @dataclass(frozen=True, eq=False)
 class Admitted:
-    """A perception cycle that may be used, at scale 1 and in arrays of its own."""
+    """A usable perception cycle, at scale 1 and in arrays of its own."""
 
     odometry: Odometry  # twists in force from the newest cycle to this one
-    detections: Detections
-    dropped: int = 0
-    refused: int = 0  # number of cycles that were refused since the last one that was used
-    notice: str = ""  # what was dropped, in the first of the cycles in which that happens
-    scale: float = 1.0  # size of the scene, in whose metres the cycle came
+    detections: Detections  # possible detections
+    dropped: int = 0  # number of impossible detections
+    refused: int = 0  # number of cycles refused since the last admitted one
+    notice: str = ""  # reason for dropping, in the first of successive cycles with dropped detections
+    scale: float = 1.0  # scale of the scene
 
     def counted(self, result: CycleResult) -> CycleResult:
-        """Return the result of the cycle in metres of its scene, with what was counted at the gate."""
+        """Return the result of the cycle in metres of its scene, with the counts of the gate."""
         result = scaled(result, self.scale)
         if not (self.dropped or self.refused):
             return result
@@ -75,31 +75,27 @@ class Admitted:
         return replace(result, notice=notice, dropped=self.dropped, refused=self.refused)
 
 
-class Gate:
-    """Check of each cycle, which counts refused cycles."""
+class Gate(Copyable):
+    """Checks of each cycle, and the number of refused cycles."""
 
     def __init__(self, limits: LimitSettings, scale: float = 1.0) -> None:
         self.scale = scale
         self.limits = scaled(limits, scale)  # in metres of the scene
-        self.refused = 0  # number of cycles that were refused since the last one that was used
-        self._refused_at: float | None = None  # the stamp (s) of the cycle that has just been refused
-        self._dropping = False
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
+        self.refused = 0  # number of cycles refused since the last admitted one
+        self._refused_at: float | None = None  # stamp (s) of the previous cycle, if it was refused
+        self._dropping = False  # whether the previous cycle had impossible detections
 
     def admit(self, odometry: Odometry, detections: Detections, newest: Newest) -> Admitted:
-        """Return a cycle as an estimator may use it; otherwise raise a ReadingError and count it as refused.
+        """Return a usable cycle at scale 1; otherwise raise a ReadingError and count it as refused.
 
-        Each twist is held until the next one, and what was in force before the newest cycle is left out.
+        Each twist is held until the next one. Twists that end before the newest cycle are left out.
         """
         refused, before, said = self.refused, self._refused_at, getattr(detections, "t", None)
         now = float(said) if isinstance(said, int | float) and abs(said) < inf else None
-        self.refused, self._refused_at = refused + 1, now  # until it has passed
+        self.refused, self._refused_at = refused + 1, now  # undone below if all checks pass
         silence = self.limits.silence
         if now is not None and before is not None and 0.0 < now - before <= silence:
-            silence = inf  # a cycle that goes on from the one just refused: two that agree end a silence
+            silence = inf  # it follows the cycle just refused: two consistent cycles end a silence
         t = _stamp(_of_type(Detections, detections, "detections").t)
         try:
             possible, notice = possible_detections(detections, t, self.limits, self.scale)
@@ -118,7 +114,7 @@ class Gate:
 
 
 def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
-    """Read a log whose cycles may all be used; otherwise raise an InputError with file, row and stamp."""
+    """Read a log and check all its cycles; an unusable one raises an InputError with file, row and stamp."""
     log, newest = read_log(folder), Newest()
     gate = Gate(limits, scale_of(log))
     for odometry, detections in split_odometry(log):
@@ -131,7 +127,7 @@ def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
 
 
 def _of_file(error: ReadingError, folder: Path, log: Log, odometry: Odometry) -> InputError:
-    """Return an error of a cycle with these twists as one of the log's file, whose header is row 1."""
+    """Convert an error of a cycle with these twists to one of the log's file, whose header is row 1."""
     of_odometry, row = error.field.startswith("odometry"), None
     if of_odometry and error.row is not None:
         row = int(log.odometry.t.searchsorted(odometry.t[error.row], side="right")) + 1
@@ -150,7 +146,7 @@ def _stamp(value: Any) -> float:
 
 
 def _check_order(stamps: Array, t: float, newest: float | None, silence: float) -> None:
-    """Refuse a cycle at t (s) before the newest one, twists (k,) later than it, and a silence before it."""
+    """Refuse a cycle at t (s) that is out of order, has later twists (`stamps` (k,)), or ends a silence."""
     if newest is not None and t <= newest:
         raise ReadingError("detections.t", "a stamp later than the newest cycle", t)
     if len(stamps) and stamps[-1] > t:
@@ -171,7 +167,7 @@ def _check_order(stamps: Array, t: float, newest: float | None, silence: float) 
 
 
 def _checked_twists(odometry: Odometry, limits: LimitSettings) -> tuple[Array, Array]:
-    """Return the stamps (k,) and the twists (k, 3), all of them finite, possible and in order of time."""
+    """Return the stamps (k,) and the twists (k, 3) if they are finite, possible and in order of time."""
     stamps = _numbers(odometry.t, "odometry.t", (-1,))
     twists = _numbers(odometry.twist, "odometry.twist", (len(stamps), len(TWIST)))
     if len(stamps) > MAX_TWISTS:
@@ -197,7 +193,7 @@ def _require(good: BoolArray, field: str, expected: str, values: NDArray[Any]) -
 
 
 def _since(odometry: Odometry, newest: Newest) -> Odometry:
-    """Return the twists in force since the newest cycle, the first from there on."""
+    """Return the twists in force since the newest cycle; the first one starts there."""
     if newest.t is None:
         return odometry
     stamps, twists = odometry.t, odometry.twist
@@ -215,7 +211,7 @@ def possible_detections(
 ) -> tuple[Detections, str]:
     """Return the possible detections of a cycle at t (s), and a notice about the others.
 
-    They are in metres of a scene of the scale, and so are the limits.
+    Detections and limits are in metres of a scene of this scale.
     """
     points = _numbers(detections.points_vehicle, "detections.points_vehicle", (-1, 2))
     count = len(points)
@@ -251,7 +247,7 @@ def _labels(values: Any, count: int) -> IntArray:
 
 
 def _numbers(values: Any, field: str, shape: tuple[int, ...]) -> Array:
-    """Return a copy of numbers with a shape, in which -1 stands for any length."""
+    """Copy numbers of a required shape, in which -1 matches any length, to an array."""
     array = _array(values, field, shape)
     if array.dtype.kind not in "fiu":
         raise ReadingError(field, "numbers", array.dtype)

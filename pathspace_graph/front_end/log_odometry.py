@@ -1,4 +1,4 @@
-"""The odometry of a whole log, and the priors of the calibrations, which hold the variables of a batch."""
+"""Odometry of a whole log, and the priors of first pose and calibrations: factors of a batch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,20 +19,20 @@ from pathspace_graph.settings.online import CalibrationSettings, OdometrySetting
 class LogOdometry:
     """The prior of the first pose, and the motion from each cycle's pose to the next."""
 
-    stamps: Array  # (P,) stamps of the perception cycles, s
-    first: Array  # (3,) pose of the first cycle in the map frame, by odometry from the first odometry stamp
+    stamps: Array  # (P,) stamps of the perception cycles (s)
+    first: Array  # (3,) prior mean of the first pose, map frame: odometry since the first odometry stamp
     first_information: Array  # (3, 3) inverse of its covariance, map frame
-    odometry: OdometryChain  # p - 1 intervals, one from each cycle's pose to the next
-    twists: Array  # (P, 3) twists in force at the cycles, m/s, m/s and rad/s
+    odometry: OdometryChain  # P - 1 intervals, one from each cycle's pose to the next
+    twists: Array  # (P, 3) twists in force at the cycles (m/s, m/s, rad/s)
     calibration_mean: Array  # (2,) prior mean of the calibration: scale error (-), yaw-rate bias (rad/s)
     calibration_sigma: Array  # (2,) its prior standard deviation
-    bias: BiasMeasurement | None = None  # of the yaw rate, measured at rest
+    bias: BiasMeasurement | None = None  # bias of the yaw rate, measured at rest
 
     def __len__(self) -> int:
         return len(self.stamps)
 
     def dead_reckoned(self, calibration: Array) -> Array:
-        """Return poses (P, 3) by odometry alone, corrected by a calibration (2,); theta is not wrapped."""
+        """Integrate the odometry, corrected by a calibration (2,), to poses (P, 3); theta is not wrapped."""
         deltas = compose(self.odometry.deltas, -self.odometry.by_calibration @ calibration)
         return accumulated(np.concatenate([self.first[None], deltas]))
 
@@ -65,14 +65,14 @@ class LogOdometry:
 
 
 def _prior(key: int, root: Array, off: Array) -> Rows:
-    """Return the rows `root off` on one variable; they belong to the first factor."""
+    """Return the rows `root off` on one variable, owned by the first factor."""
     return Rows(np.full((len(root), 1), key), root, root @ off, np.zeros(len(root), np.intp))
 
 
 def chained(
     stamps: Sequence[float], motions: Sequence[MeasuredMotion], settings: OdometrySettings
 ) -> LogOdometry:
-    """Return the odometry of cycles with these stamps (s); each motion leads to the pose of its cycle."""
+    """Chain the motions of cycles with these stamps (s); each motion ends at the pose of its cycle."""
     steps = [motion.odometry for motion in motions]
     return LogOdometry(
         stamps=np.array(stamps),
@@ -87,7 +87,7 @@ def chained(
 
 
 def mean_bias(measured: Sequence[BiasMeasurement]) -> BiasMeasurement | None:
-    """Return the mean of independent measurements of the bias by their information; None without any."""
+    """Return the information-weighted mean of independent measurements of the bias; None without any."""
     if not measured:
         return None
     information = np.array([one.sigma**-2 for one in measured])
@@ -96,7 +96,7 @@ def mean_bias(measured: Sequence[BiasMeasurement]) -> BiasMeasurement | None:
 
 
 def sensor_prior(variables: Variables, settings: CalibrationSettings) -> list[Rows]:
-    """Return the rows `(b - mean) / sigma` of the sensor's calibration b; none where it is not estimated."""
+    """Return the rows `(c - mean) / sigma` of the sensor's calibration c; none if it is not estimated."""
     if len(variables.sensor) == 0:
         return []
     root = np.diag(1.0 / np.array(settings.sigmas))

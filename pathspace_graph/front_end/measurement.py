@@ -1,8 +1,8 @@
 """Measurement of noise and sensor errors from odometry and detections alone, without a map.
 
-Cones stand still. Over a few seconds odometry is good enough to lay the sightings of one cone on each other.
-What is left depends on range, motion and time: constant errors of the sensor shift all sightings by known
-derivatives, noise scatters them, and errors that stay with a cone scatter its sightings together.
+Cones are static, and odometry is accurate over a few seconds, so the sightings of a cone should coincide.
+Their residuals depend on range, motion and time: constant errors of the sensor shift all sightings by known
+derivatives, white noise scatters them, and correlated errors shift the sightings of one cone together.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from typing import Final, Self
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import SURE, MeasuredNoise, RayNoise, huber_weights, ray_axes
@@ -21,69 +21,69 @@ from pathspace_graph.factors.sensor import BENDS_FROM, SENSOR_SIZE
 from .sightings import FOLLOW_RANGE, MAD, MIN_SPEED_SHARE, ConeTracker, SeenCycle, Sightings, TwistRecord
 
 DRIFT: Final = np.array([0.05, 0.05, 0.0017])
-"""Assumed drift of any odometry (m, m, rad per root of s): 0.5 m and 0.9 degrees after 90 s.
+"""Assumed drift of any odometry (m/sqrt(s), m/sqrt(s), rad/sqrt(s)): 0.5 m and 0.9 degrees after 90 s.
 
-It cannot be measured on an open drive: a cone stays in view for some 3 s, in which an error of the speed of
-less than 0.05 m/s is lost in the noise of its detections."""
+It is not observable on an open drive: a cone is in view for about 3 s, and the noise of its detections hides
+an error of the speed below 0.05 m/s."""
 PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02, 0.02])
-"""Weak priors of the sensor's errors (rad, m, s, -, m), of the bend of its ranges (1/m) and of the yaw rate's
-bias (rad/s), one sigma. Without the bend, yaw, lateral offset and scale would take it up."""
-OF_BEND: Final = SENSOR_SIZE  # place of the bend among the constants
-FIRST_ALONG: Final = (0.1, 0.04)
-FIRST_ACROSS: Final = (0.05, 0.016)  # noise that the iteration begins with: m and m/m, then m and rad
-PASSES: Final = 4  # times that cones are followed
-FOLLOWED: Final = 40  # cycles in which cones are followed in a step
-ROUNDS_FIRST: Final = 5  # times that errors, noise and weights are found in turn
-ROUNDS_AGAIN: Final = 3  # rounds of a pass that starts from measured noise, which is nearly converged
-CLUSTER_TIME: Final = 3.0  # time (s) over which errors of the odometry are alike
-COUNTED: Final = 0.8  # share of `FOLLOW_RANGE` beyond which cones are followed only where they seem nearer
-HARDLY: Final = 1e-6  # weight of sightings beyond: a cone seen only there still has a place
-NOISE_HUBER: Final = 2.0
-MIN_COUNT: Final = 5  # least number of sightings of a cone that counts
-MIN_ROWS: Final = 60  # least number of sightings with a reference that tell the noise of detections
-NEAR_SHARE: Final = 0.6  # share of a sighting's range within which the same cone's others are its reference
-NEAR_TIME: Final = 6.0  # greatest time to a reference (s), over which odometry is trusted
-BINS: Final = 8
-STAY_TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # correlation times that are tried (s)
-LAGS: Final = (0.05, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)  # edges of the lags at which correlation is measured (s)
-MODEL_ERROR: Final = 0.05  # share of an error that the linear model may be wrong by, one sigma
-FIRST_SHARE: Final = 0.5  # share of a cone's error that stays with it, unless cones say otherwise
-FIRST_CONES: Final = 8.0  # number of cones that `FIRST_SHARE` counts as much as
-LEAST_NOISE: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): a cone is no point
+"""Prior standard deviations of the constants: errors of the sensor (rad, m, s, -, m), bend of its ranges
+(1/m) and bias of the yaw rate (rad/s). Without the bend, yaw, lateral offset and scale would absorb it."""
+OF_BEND: Final = SENSOR_SIZE  # index of the bend among the constants
+FIRST_ALONG: Final = (0.1, 0.04)  # initial noise along the ray: constant (m) and by range (-)
+FIRST_ACROSS: Final = (0.05, 0.016)  # initial noise across the ray: constant (m) and by range (rad)
+PASSES: Final = 4  # passes over the cycles, each of which tracks the cones again
+FOLLOWED: Final = 40  # cycles per step in which cones are tracked
+ROUNDS_FIRST: Final = 5  # alternations of errors, noise and weights in a pass
+ROUNDS_AGAIN: Final = 3  # alternations in a pass that starts from measured noise, nearly converged
+CLUSTER_TIME: Final = 3.0  # time (s) over which errors of the odometry are correlated
+COUNTED: Final = 0.8  # share of `FOLLOW_RANGE` beyond which only underestimated ranges are in reach
+HARDLY: Final = 1e-6  # weight of sightings beyond it, so that a cone seen only there has a position
+NOISE_HUBER: Final = 2.0  # threshold of Huber's loss (sigmas)
+MIN_COUNT: Final = 5  # least number of sightings of a cone in use
+MIN_ROWS: Final = 60  # least number of sightings with a reference from which noise is estimated
+NEAR_SHARE: Final = 0.6  # references of a sighting: sightings of its cone within this share of its range
+NEAR_TIME: Final = 6.0  # longest time to a reference (s), over which odometry is trusted
+BINS: Final = 8  # largest number of range bins
+STAY_TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # candidate correlation times (s)
+LAGS: Final = (0.05, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)  # edges of the lag bins of the correlation (s)
+MODEL_ERROR: Final = 0.05  # relative error of the linear model, one sigma
+FIRST_SHARE: Final = 0.5  # prior share of the variance that is correlated
+FIRST_CONES: Final = 8.0  # weight of `FIRST_SHARE`, in cones
+LEAST_NOISE: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): cones have a size
 
 Rays = tuple[RayNoise, RayNoise]
 """Noise along the ray and across it."""
 Lagged = tuple[IntArray, IntArray, Array, IntArray]
-"""Pairs of sightings of one cone, by index, their lags (s), and the number of the edge before in `LAGS`."""
+"""Pairs of sightings of one cone, by index, with their lags (s) and bins in `LAGS`."""
 
 
 @dataclass(eq=False)
 class _Cones:
-    """Sightings of cones seen often enough, sorted by cone, with their linear model `p + A b` in the map."""
+    """Sightings of cones with enough of them, sorted by cone, with the linear model `p + A b`, map frame."""
 
     table: Sightings
     begins: IntArray  # (c,) row of each cone's first sighting
     counts: IntArray  # (c,) number of its sightings
     axes: Array  # (2, n, 2) unit vectors along the ray and across it, map frame
-    points: Array
-    ranges: Array  # (n,) range of the cone as the sensor measures it, without noise (m)
-    columns: Array  # (n, 2, 7) derivatives by the constants (`PRIOR`)
+    points: Array  # (n, 2) sightings p in m, map frame by dead reckoning
+    ranges: Array  # (n,) measured range of the cone, without noise once `without` has run (m)
+    columns: Array  # (n, 2, 7) derivatives A by the constants (`PRIOR`)
 
     def without(self, off: Array) -> Self:
-        """Return the sightings with ranges and derivatives where they would be without their errors (n, 2).
+        """Return the sightings with ranges and derivatives at positions without their noise `off` (n, 2).
 
-        With the noise in them weights would prefer short sightings, and errors come out too small.
+        Noisy ranges would bias the weights towards short sightings and shrink the estimated errors.
         """
         seen = self.table.point - in_vehicle(off, self.table.pose)
         columns = _columns(self.table, np.repeat(self.begins, self.counts), seen)
         return replace(self, ranges=np.hypot(*seen.T), columns=columns)
 
     def on_axes(self, off: Array, rows: IntArray | slice = slice(None)) -> Array:
-        """Return offsets (k, 2), map frame, of sightings at rows (k,) along and across their rays (2, k)."""
+        """Return the components (2, k) of offsets (k, 2), map frame, along and across the rays of `rows`."""
         return np.array([(off * axis[rows]).sum(axis=1) for axis in self.axes])
 
     def sigmas(self, noise: Rays) -> Array:
-        """Return the standard deviations (2, n) of the sightings along and across their rays (m)."""
+        """Return the standard deviations (2, n) of the sightings along and across their rays, in m."""
         return np.array([one.sigmas(self.ranges) for one in noise])
 
     def information(self, noise: Rays, weights: Array) -> Array:
@@ -113,15 +113,15 @@ def _columns(table: Sightings, first: IntArray, seen: Array) -> Array:
 
 
 def runs(groups: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the first row and the size (c,) of each group; groups (n,) of equal number are neighbours."""
+    """Return the first row (c,) and the size (c,) of each group; equal groups (n,) are adjacent."""
     begins = np.flatnonzero(np.diff(groups, prepend=-1))
     return begins, np.diff(np.append(begins, len(groups)))
 
 
 def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Array]:
-    """Return constants b (7,), both covariances of them, and what is left (n, 2) of the sightings.
+    """Return the constants b (7,), two covariances (7, 7), and the residuals (n, 2) of the sightings.
 
-    The cones' places, weighted means of `p + A b`, are eliminated. One covariance is `clustered`.
+    The cones' positions, weighted means of `p + A b`, are eliminated. The second covariance is `clustered`.
     """
     columns, points, own, vectors = kernels.centred(cones.begins, information, cones.columns, cones.points)
     covariance = np.asarray(np.linalg.inv(own.sum(axis=0) + np.diag(PRIOR**-2)), np.float64)
@@ -132,11 +132,10 @@ def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Arra
 
 
 def clustered(middle: Array, scores: Array, covariance: Array) -> Array:
-    """Return the covariance (7, 7) of the constants by how much the stretches of the drive disagree.
+    """Return the cluster-robust covariance `P (sum g g') P` (7, 7) of the constants (White's estimator).
 
-    With the scores g (c, 7) of cones, which were seen about `middle` (c,) in s, summed over `CLUSTER_TIME`
-    seconds it is `P (sum g g') P` (White's estimator for clusters), which has the errors of the odometry in
-    it.
+    g sums the scores (c, 7) of the cones seen in a stretch of `CLUSTER_TIME` seconds, by the mean stamp
+    `middle` (c,) of each cone, in s. So it includes the errors of the odometry.
     """
     _, stretch = np.unique(np.floor(middle / CLUSTER_TIME), return_inverse=True)
     count = int(stretch.max()) + 1
@@ -146,10 +145,10 @@ def clustered(middle: Array, scores: Array, covariance: Array) -> Array:
 
 
 def _residuals(cones: _Cones, errors: Array, noise: Rays, odometry: Array) -> tuple[IntArray, Array, Array]:
-    """Return rows (k,) of far sightings, and what is left of them about nearer ones of the same cone.
+    """Return the rows (k,) of sightings that have nearer references, and their offsets from these.
 
-    The offsets (2, k) along and across the ray (m) are without the constant errors. With them come the
-    variances (2, k) of reference and odometry (m^2), with the drift (3,) by root of s of white noise.
+    The offsets (2, k) along and across the ray (m) are corrected for the constant errors. The variances
+    (2, k) of references and odometry (m^2) follow. `odometry` (3,) is its random walk (m, m, rad / sqrt(s)).
     """
     points, sigmas = cones.points + cones.columns @ errors, cones.sigmas(noise)
     weight = 1.0 / (sigmas**2).mean(axis=0)
@@ -165,7 +164,7 @@ def _residuals(cones: _Cones, errors: Array, noise: Rays, odometry: Array) -> tu
 
 
 def pairs(groups: IntArray) -> tuple[IntArray, IntArray]:
-    """Return all ordered pairs of rows of one group, by index; groups (n,) of equal number are neighbours."""
+    """Return all ordered pairs of rows in the same group, by index; equal groups (n,) are adjacent."""
     begins, counts = runs(groups)
     repeats = np.repeat(counts, counts)
     i = np.repeat(np.arange(len(groups)), repeats)
@@ -176,10 +175,10 @@ def pairs(groups: IntArray) -> tuple[IntArray, IntArray]:
 def _ray_noise(
     cones: _Cones, rows: IntArray, lagged: Lagged, off: Array, reference: Array, least: tuple[float, float]
 ) -> RayNoise:
-    """Return the noise along or across the ray by range, and how long it stays, from `_residuals` (k,)."""
+    """Return the noise along or across the ray by range, with its correlation, from `_residuals` (k,)."""
     ranges = cones.ranges[rows]
     order, bins = np.argsort(ranges), np.arange(max(min(BINS, len(rows) // (MIN_ROWS // 2)), 2))
-    counts = len(rows) // len(bins) + (bins < len(rows) % len(bins))  # as equal as can be, by range
+    counts = len(rows) // len(bins) + (bins < len(rows) % len(bins))  # bins of equal count, by range
     begins, size = counts.cumsum() - counts, np.abs(off[order])
     middle, known = (np.add.reduceat(of[order], begins) / counts for of in (ranges, reference))
     size = size[np.lexsort((size, np.repeat(bins, counts)))]
@@ -194,7 +193,7 @@ def _ray_noise(
 
 
 def line_through(ranges: Array, sigma: Array) -> Array:
-    """Return `a, b >= 0` with the least `sum ((a + b r) / sigma - 1)^2` for sigmas (k,) at ranges r (k,)."""
+    """Minimize `sum ((a + b r) / sigma - 1)^2` over `a, b >= 0` for sigmas (k,) at ranges r (k,)."""
     columns = np.stack([np.ones(len(ranges)), ranges], axis=1) / sigma[:, None]
     line = np.linalg.lstsq(columns, np.ones(len(sigma)), rcond=None)[0]
     if (line >= 0.0).all():
@@ -205,7 +204,7 @@ def line_through(ranges: Array, sigma: Array) -> Array:
 
 
 def _lagged(cone: IntArray, t: Array) -> Lagged:
-    """Return the pairs of one cone's sightings (k,) whose lag is inside of `LAGS`."""
+    """Return the pairs of sightings (k,) of the same cone whose lags are within `LAGS`."""
     i, j = pairs(cone)
     lag = t[j] - t[i]
     inside = (lag >= LAGS[0]) & (lag < LAGS[-1])
@@ -213,7 +212,7 @@ def _lagged(cone: IntArray, t: Array) -> Lagged:
 
 
 def _staying(lagged: Lagged, off: Array, reference: Array, sigma: Array) -> tuple[float, float]:
-    """Return share and correlation time (s) of the errors (k,) of a cone that stay with it."""
+    """Return share of the variance and correlation time (s) of the correlated part of errors `off` (k,)."""
     whitened, own = np.clip(off / sigma, -3.0, 3.0), reference / sigma**2
     i, j, lag, place = lagged
     product = whitened[i] * whitened[j] - 0.5 * (own[i] + own[j])
@@ -232,28 +231,22 @@ def _staying(lagged: Lagged, off: Array, reference: Array, sigma: Array) -> tupl
     return float(shares[best]), STAY_TIMES[best]
 
 
-class Measurement:
+class Measurement(Copyable):
     """Measurement of noise in steps short enough for a perception cycle.
 
-    Each pass follows the cones by what was found so far, and then finds errors, noise and weights in turn.
+    Each pass tracks the cones with the estimate so far, then alternates between errors, noise and weights.
     """
 
     def __init__(self, cycles: Sequence[SeenCycle], found: MeasuredNoise) -> None:
-        """Begin with the cycles of a drive, and with what is known: the noise of the odometry at least."""
+        """Start with the cycles of a drive and an estimate, which has the noise of the odometry at least."""
         self._cycles, self._passes = cycles, PASSES if found.along is None else 1
         self._begin(found)
 
     @classmethod
     def of(cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None) -> Self | None:
-        """Return a measurement; None where not even the noise of the odometry can be told."""
+        """Return a measurement, or None if not even the noise of the odometry can be estimated."""
         found = odometry_of(twists, known)
         return None if found is None else cls(cycles, found)
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently."""
-        other = shallow(self)
-        other._tracker = self._tracker.copy()
-        return other
 
     def _begin(self, found: MeasuredNoise) -> None:
         self._found, self._tracker, self._followed = found, ConeTracker(found), 0
@@ -261,7 +254,7 @@ class Measurement:
         self._cones: _Cones | None = None
 
     def advance(self) -> MeasuredNoise | None:
-        """Make the next step; return what was found if it is the last one."""
+        """Take the next step; return the measured noise after the last one."""
         if self._cones is not None:
             return self._round(self._cones)
         cycles = self._cycles[self._followed : self._followed + FOLLOWED]
@@ -298,9 +291,9 @@ class Measurement:
         return None if self._rounds else self._passed(self._result(cones, errors, *covariances))
 
     def _result(self, cones: _Cones, errors: Array, covariance: Array, clustered: Array) -> MeasuredNoise:
-        """Return what was found, with constants (7,) and both covariances (7, 7) of them.
+        """Return the measured noise, with the constants (7,) and both of their covariances (7, 7).
 
-        What stays of a cone's errors shifts its place; only what changes is taken for an error of the sensor.
+        The constant part of a cone's error shifts its position; only the rest biases the constants.
         """
         stamps = np.unique(self._sightings[0].t)
         counts = int(np.median(cones.counts)), float(np.median(np.diff(stamps)))
@@ -316,7 +309,7 @@ class Measurement:
 
 
 def odometry_of(twists: TwistRecord, known: MeasuredNoise | None) -> MeasuredNoise | None:
-    """Return what is known, with the noise of the odometry; None where not even that can be told."""
+    """Return `known` with the measured noise of the odometry; None if there are too few twists."""
     white = twists.white()
     if white is None:
         return None
@@ -333,9 +326,9 @@ def with_detections(
     t: Array,
     counts: tuple[int, float, float],
 ) -> MeasuredNoise:
-    """Return what was found with the noise of detections that were seen at t (n,), and constants (7,).
+    """Return `found` with the noise of detections at stamps t (n,) and the constants `errors` (7,).
 
-    The counts are the detections of one cone, the time between them (s), and the detections of a cycle.
+    `counts` are the detections per cone, the time between them (s), and the detections per cycle.
     """
     sigmas = np.hypot(sigmas, MODEL_ERROR * np.abs(errors))
     is_bent = np.abs(errors[OF_BEND]) > SURE * sigmas[OF_BEND]

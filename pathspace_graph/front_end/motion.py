@@ -1,11 +1,11 @@
-"""The motion between two cycles: odometry, checked against what the detections say of it."""
+"""The motion between two cycles: odometry, checked by scan matching of the detections."""
 
 from dataclasses import replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import integrate_twists, integrated_odometry
 from pathspace_graph.factors.se2 import compose, relative, rotation
@@ -17,34 +17,34 @@ from .gate import Newest
 from .scan_matching import MIN_DOUBTING, REACHES, REACHES_CHECK, Match, ScanMatcher, Seen, SensorErrors
 from .standstill import Standstill
 
-NO_CALIBRATION: Final = np.zeros((3, 2))  # derivative of a motion that is not by odometry
-DOUBT_AGAIN: Final = 3.8  # contradiction of an odometry that was contradicted not long ago, sigmas
-DISTRUST: Final = 12.0  # time for which it is distrusted so, s: wheels that slip do so in the next bends, too
-DOUBT_RATE: Final = 2.0  # agreement within which a contradicted odometry's yaw rate is believed, sigmas
-MAX_CHANGE: Final = 3.5  # largest difference of a motion from the one before, in `SIGMAS_CHANGE`
-SIGMAS_CHANGE: Final = (3.0, 1.0, 0.5)  # m/s, m/s, rad/s from cycle to cycle without odometry
-BEFORE: Final = 0.5  # share of a contradiction added to its motion's sigma: it may have begun earlier
-WIDENED: Final = 1.5  # of the sigmas of a motion by detections, which the estimator uses again
-HOLD: Final = 0.15  # time for which a twist is held without a loss of certainty, s
-HOLD_INTERVALS: Final = 3.0  # shortest intervals of twists for which it is held so, if longer
-STUCK: Final = 3  # twists equal to the one before from which readings are stuck
-REST_TIME: Final = 1.0  # time of standing from which the mean yaw rate measures the bias, s
-REST_TWIST: Final = (0.1, 0.1, 0.05)  # largest mean twist at rest, m/s, m/s, rad/s, but for noise
-REST_SIGMAS: Final = 3.0  # standard deviations of the mean that count as its noise
-SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)  # m, m, rad, of a motion at rest from cycle to cycle
-SIGMAS_STANDS: Final = (0.02, 0.02, 0.002)  # of one that the detections alone tell
+NO_CALIBRATION: Final = np.zeros((3, 2))  # derivative by the calibration of a motion without odometry
+GATE_DISTRUSTED: Final = 3.8  # gate (sigmas) for `DISTRUST` seconds after a contradiction
+DISTRUST: Final = 12.0  # time (s): wheels that slip do so again in the next bends
+DOUBT_RATE: Final = 2.0  # gate (sigmas) of the yaw rate of a contradicted odometry
+MAX_CHANGE: Final = 3.5  # largest change of the motion between cycles, in `SIGMAS_CHANGE`
+SIGMAS_CHANGE: Final = (3.0, 1.0, 0.5)  # change of the velocity in a cycle without odometry (m/s, m/s, rad/s)
+BEFORE: Final = 0.5  # share of a contradiction added to the sigma of its motion: it may have begun earlier
+WIDENED: Final = 1.5  # inflation of the sigmas of a matched motion: the estimator uses the detections again
+HOLD: Final = 0.15  # time for which a twist is held without additional noise (s)
+HOLD_INTERVALS: Final = 3.0  # the same in shortest intervals between twists, if that is longer
+STUCK: Final = 3  # number of twists equal to the previous one from which readings are stuck
+REST_TIME: Final = 1.0  # time at rest over which the mean yaw rate measures the bias (s)
+REST_TWIST: Final = (0.1, 0.1, 0.05)  # largest mean twist at rest (m/s, m/s, rad/s), without its noise
+REST_SIGMAS: Final = 3.0  # allowance for the noise of the mean (sigmas)
+SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)  # motion between cycles at rest by odometry (m, m, rad)
+SIGMAS_STANDS: Final = (0.02, 0.02, 0.002)  # motion between cycles at rest by detections alone (m, m, rad)
 
 
-class MotionCheck:
-    """Odometry of each cycle, checked against the detections of the newest cycles.
+class MotionCheck(Copyable):
+    """Check of each cycle's odometry against the detections of the newest cycles.
 
-    Its frame is that of the motion so far, which drifts; only its newest part is used.
+    Poses are in the frame of dead reckoning, which drifts; only the newest ones are used.
     """
 
     def __init__(self, sigma: Array, settings: MotionSettings) -> None:
-        self.sigma = sigma  # (3,) of a measured twist: m/s, m/s, rad/s
-        self.seen_again: BoolArray = np.zeros(0, bool)  # (m,) of the newest cycle, like `Reading.seen_again`
-        self.pose: Array = np.zeros(3)  # (3,) in the frame of the front end, from 0 on
+        self.sigma = sigma  # (3,) standard deviation of a measured twist (m/s, m/s, rad/s)
+        self.seen_again: BoolArray = np.zeros(0, bool)  # (m,) `Reading.seen_again` of the newest cycle
+        self.pose: Array = np.zeros(3)  # (3,) newest pose by dead reckoning; the first one is 0
         self._settings = settings
         self._twists = HeldTwists(settings)
         self._matcher = ScanMatcher(settings)
@@ -52,17 +52,10 @@ class MotionCheck:
         self._standstill = Standstill()
         self._velocity: Array | None = None
         self._t: float | None = None
-        self._doubted_at = -np.inf  # the odometry was contradicted last at this stamp (s)
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently."""
-        other = shallow(self)
-        other._twists, other._matcher = shallow(self._twists), self._matcher.copy()
-        other._rest, other._standstill = self._rest.copy(), self._standstill.copy()
-        return other
+        self._doubted_at = -np.inf  # stamp of the last contradiction (s)
 
     def set_noise(self, sigma: Array) -> None:
-        """Take other standard deviations (3,) of a twist; what was learned of the sensor is forgotten."""
+        """Set the standard deviation (3,) of a twist, and forget the learned errors of the sensor."""
         self.sigma = sigma
         self._matcher.forget()
         self._standstill = Standstill()
@@ -74,17 +67,17 @@ class MotionCheck:
         may_doubt: bool | None = True,
         is_line: BoolArray | None = None,
     ) -> MeasuredMotion:
-        """Return the motion since the last cycle, whose odometry may be doubted if the noise is known.
+        """Return the motion since the previous cycle.
 
-        If `may_doubt` is None, the detections are only asked where the odometry is missing or stuck. Points
-        of a line (m,) tell the motion across it, and nothing of a standstill.
+        Detections may contradict the odometry if `may_doubt`. If that is None, they are matched only where
+        the odometry is missing or stuck. Points of a line (`is_line` (m,)) cannot show a standstill.
         """
         is_line = np.zeros(len(detections.labels), bool) if is_line is None else is_line
         t, matcher = detections.t, self._matcher
         motion = self._twists.integrate(odometry, t, self._t, self.sigma)
         twist, delta = motion.odometry.twist, motion.odometry.delta
         seen = matcher.corrected(detections, twist, is_line)
-        limit = DOUBT_AGAIN if t - self._doubted_at < DISTRUST else self._settings.doubt
+        limit = GATE_DISTRUSTED if t - self._doubted_at < DISTRUST else self._settings.doubt
         cones = matcher.excess * detections.covariances[~is_line]
         self._standstill.add(t, seen.points[~is_line], cones, delta)
         standing, agrees = self._standing(motion) if may_doubt else None, None
@@ -112,7 +105,7 @@ class MotionCheck:
 
     @property
     def errors(self) -> SensorErrors:
-        """How much the sensor is turned, and how late its detections are."""
+        """Yaw and latency of the sensor, learned so far."""
         return self._matcher.errors
 
     @property
@@ -120,7 +113,7 @@ class MotionCheck:
         return Newest(self._t, self._twists.newest)
 
     def _at_rest(self, motion: MeasuredMotion, t: float, seen: Seen, limit: float) -> MeasuredMotion:
-        """Return the motion of a vehicle that rests by its odometry, unless the detections deny it."""
+        """Return the motion of a vehicle at rest by its odometry, unless the detections contradict that."""
         matcher, none = (
             self._matcher,
             integrated_odometry(np.zeros(3), np.diag(SIGMAS_REST) ** 2, NO_CALIBRATION),
@@ -132,7 +125,7 @@ class MotionCheck:
         return MeasuredMotion(none, np.zeros((1, 3)), bias=self._rest.bias(t, self.sigma))
 
     def _standing(self, motion: MeasuredMotion) -> MeasuredMotion | None:
-        """Return the motion back to where the vehicle stands, if the cones clearly say that it does."""
+        """Return the motion back to where the vehicle stands, if the cones clearly show a standstill."""
         place = self._standstill.place(self._settings.doubt)
         if place is None:
             return None
@@ -144,9 +137,9 @@ class MotionCheck:
     def _checked(
         self, motion: MeasuredMotion, t: float, seen: Seen, may_doubt: bool | None, limit: float
     ) -> tuple[MeasuredMotion, Match | None]:
-        """Return the motion, or that of the detections where they contradict it, or where it is missing.
+        """Return the motion by odometry, or by detections if these contradict it or it is missing.
 
-        With it comes the match that agrees with the odometry, if there is one.
+        The second value is the match that agrees with the odometry, if there is one.
         """
         unasked = may_doubt is None and not (motion.missing or motion.stuck)
         if self._t is None or t <= self._t or unasked:
@@ -175,7 +168,7 @@ class MotionCheck:
         return self._replaced(motion, best, going_on, dt) if failed else motion, None
 
     def _best(self, seen: Seen, starts: tuple[Array, Array], dt: float) -> Match | None:
-        """Return the best possible match from two starts, of which the first goes on as before."""
+        """Return the best possible match from two initial poses; the first assumes constant velocity."""
         matches = [self._matcher.match(seen, start, REACHES) for start in starts]
         possible = [one for one in matches if one is not None and self._is_possible(one, starts[0], dt)]
         return max(possible, key=lambda one: one.matched - one.misfit, default=None)
@@ -188,7 +181,7 @@ class MotionCheck:
     def _replaced(
         self, motion: MeasuredMotion, best: Match | None, going_on: Array, dt: float
     ) -> MeasuredMotion:
-        """Return the motion by the detections together with going on (3,) as before."""
+        """Fuse a match with the motion `going_on` (3,) of constant velocity, in place of the odometry."""
         odometry, mean, matcher = motion.odometry, going_on.copy(), self._matcher
         covariance = np.diag((np.array(SIGMAS_CHANGE) * dt) ** 2)
         if best is not None:
@@ -212,27 +205,27 @@ class MotionCheck:
         return MeasuredMotion(replace(replaced, twist=twist), twist[None], *found)
 
 
-class HeldTwists:
-    """Twists as they are measured, each held until the next one."""
+class HeldTwists(Copyable):
+    """Integration of measured twists, each held until the next one."""
 
     def __init__(self, settings: MotionSettings) -> None:
-        self.newest: Array | None = None  # (3,) twist that was measured last
+        self.newest: Array | None = None  # (3,) newest measured twist
         self._t = -np.inf  # its stamp (s)
-        self._interval = np.inf  # between measured twists (s); it is infinite until two were measured
+        self._interval = np.inf  # shortest time between measured twists (s)
         self._accelerations = np.array(settings.accelerations)
 
     def integrate(self, odometry: Odometry, t: float, before: float | None, sigma: Array) -> MeasuredMotion:
-        """Return the motion from the cycle before until t (s), whose noise grows where a twist is held long.
+        """Integrate the twists from the previous cycle, at `before` (s), to t (s).
 
-        sigma is that of a twist (3,).
+        The noise of a twist, with the standard deviation sigma (3,), grows while it is held for long.
         """
         if len(odometry.t) == 0:
-            none = integrate_odometry(odometry, t, sigma)  # which is certain that nothing moves
+            none = integrate_odometry(odometry, t, sigma)  # no motion, with certainty
             return MeasuredMotion(none, odometry.twist, missing=before is not None)
         measured = odometry.t
         goes_on = self.newest is not None and (odometry.twist[0] == self.newest).all()
         if before is not None and measured[0] <= before and goes_on:
-            measured = np.concatenate([[self._t], measured[1:]])  # the first row only goes on with it
+            measured = np.concatenate([[self._t], measured[1:]])  # the first row repeats it
         self._t, self.newest = float(measured[-1]), odometry.twist[-1]
         if len(measured) > 1:
             self._interval = min(self._interval, float((measured[1:] - measured[:-1]).min()))
@@ -247,15 +240,11 @@ class HeldTwists:
         return MeasuredMotion(integrated, odometry.twist, False, missing, stuck, None, durations, excess)
 
 
-class Rest:
-    """Judge of whether the vehicle stands, by the odometry; it averages the yaw rate meanwhile."""
+class Rest(Copyable):
+    """Detection of a standstill by the odometry, and the mean yaw rate during it."""
 
     def __init__(self) -> None:
         self.end()
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
 
     def end(self) -> None:
         self._since: float | None = None
@@ -264,7 +253,7 @@ class Rest:
         self._rate_count = 0
 
     def update(self, odometry: Odometry, t: float, sigma: Array) -> bool:
-        """Return whether the vehicle has stood for long enough at t (s), by twists with a sigma (3,)."""
+        """Whether the vehicle has been at rest for `REST_TIME` at t (s), by twists with a sigma (3,)."""
         twists = odometry.twist[1:] if len(odometry.twist) > 1 else odometry.twist  # the first one is held
         moves = not len(twists) or twists[:, 0].min() > REST_TWIST[0] + REST_SIGMAS * sigma[0]
         if moves or not _is_still(twists.mean(axis=0), len(twists), sigma):
@@ -278,7 +267,7 @@ class Rest:
         return _is_still(self._sum / self._count, self._count, sigma) and t - self._since >= REST_TIME
 
     def bias(self, t: float, sigma: Array) -> BiasMeasurement | None:
-        """Return the bias that was measured since the last call, if that is long enough ago at t (s)."""
+        """Return the bias measured since the last result, if that is `REST_TIME` ago at t (s)."""
         if t - self._measured_since < REST_TIME:
             return None
         mean, sigma_mean = self._rate_sum / self._rate_count, float(sigma[2]) / np.sqrt(self._rate_count)
@@ -287,5 +276,5 @@ class Rest:
 
 
 def _is_still(mean: Array, count: int, sigma: Array) -> bool:
-    """Return whether a mean (3,) of this number of twists with a sigma (3,) is that of a vehicle at rest."""
+    """Whether the mean (3,) of `count` twists with a sigma (3,) is consistent with rest."""
     return bool((np.abs(mean) < REST_TWIST + REST_SIGMAS * sigma / np.sqrt(count)).all())

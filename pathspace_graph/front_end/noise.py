@@ -1,13 +1,13 @@
-"""Noise that is used in a drive: what the log states, or what the drive itself has shown so far."""
+"""Noise used in a drive: stated by the log, or measured on the drive so far."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.factors.sensor import SENSOR, SENSOR_SIZE
@@ -20,42 +20,36 @@ from .line_noise import LineMeasurement
 from .measurement import Measurement
 from .sightings import SeenCycle, TwistRecord
 
-FIRST: Final = 8.0  # driving time (s) after which noise is measured first
-AGAIN: Final = 1.5  # growth of the driving time after which it is measured again
-MOST_CYCLES: Final = 300  # newest cycles on which it is measured, which bounds its time
-DRIVING_SPEED: Final = 0.3  # speed from which on the vehicle drives (m/s)
-SCALE: Final = SENSOR.index("range_scale")
-SIGMA_FREE: Final = 0.02  # of the scale of the ranges, beside that measured, where odometry sets the size (-)
-REFERENCE_RANGE: Final = 10.0  # range at which the scatter of ranges tells how well their scale is known (m)
+FIRST: Final = 8.0  # driving time before the first measurement of noise (s)
+AGAIN: Final = 1.5  # growth of the driving time between measurements
+MOST_CYCLES: Final = 300  # largest number of newest cycles in a measurement, which bounds its time
+DRIVING_SPEED: Final = 0.3  # least speed of driving (m/s)
+SCALE: Final = SENSOR.index("range_scale")  # index of the scale error of the ranges
+SIGMA_FREE: Final = 0.02  # prior sigma of the scale of the ranges where odometry sets the size (-)
+REFERENCE_RANGE: Final = 10.0  # range at which the noise of ranges bounds their scale error (m)
 
 
-class NoiseLearner:
-    """Measurement of the noise of a drive as it goes on, which never reads ahead."""
+class NoiseLearner(Copyable):
+    """Online measurement of the noise of a drive."""
 
     def __init__(self, known: KnownNoise, use: str | None, *, of_lines: bool = False) -> None:
-        """Keep what is known before the drive; `use` is `MapperSettings.noise`.
+        """Start with the noise known before the drive; `use` is `MapperSettings.noise`.
 
-        All detections that it observes are points of lines, or none are.
+        `of_lines` says whether all observed detections are points of lines, or none are.
         """
         self.known = known
         self.of_odometry = use == "measured" or (use is None and not known.odometry_stated)
+        """Whether the noise of the odometry is measured."""
         self.of_detections = use == "measured" or (use is None and not known.detections_stated)
-        """Whether the noise of odometry and detections is the measured one."""
-        self.of_sensor = use != "stated"  # its constant errors: stated noise says nothing of them
-        self.measured = known.measured  # what was measured so far, or by an earlier look at the whole drive
-        self._cycles: tuple[SeenCycle, ...] = ()  # the newest ones
+        """Whether the noise of the detections is measured."""
+        self.of_sensor = use != "stated"  # whether constant errors are measured: stated noise has none
+        self.measured = known.measured  # newest measurement, or the one of a batch on the whole drive
+        self._cycles: tuple[SeenCycle, ...] = ()  # newest cycles
         self._twists = TwistRecord()
         self._of_lines = of_lines
         self._measurement: Measurement | LineMeasurement | None = None
         self._driven, self._due = 0.0, FIRST
         self._t: float | None = None
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently."""
-        other = shallow(self)
-        other._twists = self._twists.copy()
-        other._measurement = self._measurement and self._measurement.copy()
-        return other
 
     @property
     def is_learning(self) -> bool:
@@ -74,7 +68,7 @@ class NoiseLearner:
     def observe(
         self, odometry: Odometry, detections: Detections, motion: MeasuredMotion, pose: Array
     ) -> bool:
-        """Learn from a cycle at a pose (3,) of the front end; return whether the noise was measured anew."""
+        """Add a cycle at a pose (3,) by dead reckoning; return whether a measurement was completed."""
         if not self.is_learning:
             return False
         self._twists.add(odometry)
@@ -93,7 +87,7 @@ class NoiseLearner:
         return True
 
     def for_check(self, detections: Detections, twist: Array) -> Detections:
-        """Return detections for comparisons over a few cycles: without sure constant errors."""
+        """Return detections for scan matching, corrected for significant constant errors."""
         measured, points = self.measured, detections.points_vehicle
         if not self.of_sensor or measured is None or measured.along is None:
             return detections
@@ -103,7 +97,10 @@ class NoiseLearner:
         return Detections(detections.t, corrected, covariances, detections.labels)
 
     def for_map(self, detections: Detections) -> Detections:
-        """Return unbent detections whose covariances say what each adds to the others of its cone."""
+        """Return detections for the map, corrected for the bend of the ranges.
+
+        Their covariances are inflated so that sightings of one cone count as independent.
+        """
         measured, points = self.measured, detections.points_vehicle
         if not self.of_sensor or measured is None:
             return detections
@@ -113,19 +110,19 @@ class NoiseLearner:
         return Detections(detections.t, measured.unbent(points), covariances, detections.labels)
 
     def motions_of_lap(self, motions: Sequence[MeasuredMotion]) -> Sequence[MeasuredMotion]:
-        """Return the motions of a drive with the noise that is known now.
+        """Return the motions of a drive with the noise known now.
 
-        Its first seconds were driven before any was measured, and decide the heading of the map.
+        The first seconds, before any measurement, determine the heading of the map.
         """
         if self.of_odometry and self.measured is not None:
             return [motion.with_sigma(self.twist_sigma) for motion in motions]
         return motions
 
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
-        """Return settings with measured priors of the calibrations where one of the old ones is contradicted.
+        """Return settings with measured priors of all calibrations if one of the old priors is contradicted.
 
-        `|b - m| > doubt hypot(sigma, sigma_prior)` contradicts the prior of an error b, and then all errors
-        are what was measured. Of ranges and speeds only the ratio can be seen: the scale of one is held.
+        `|c - mean| > doubt hypot(sigma, sigma_prior)` contradicts the prior of an error c. Only the ratio of
+        ranges and speeds is observable, so one of their scales is fixed.
         """
         measured, sensor = self.measured, settings.calibration
         contradicted = self._contradicted(settings)
@@ -146,7 +143,7 @@ class NoiseLearner:
         return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
 
     def _contradicted(self, settings: MapperSettings) -> BoolArray:
-        """Return which errors (5,) of the sensor are measured, and contradict their priors."""
+        """Return which measured errors (5,) of the sensor contradict their priors."""
         measured, sensor = self.measured, settings.calibration
         if not self.of_sensor or measured is None or measured.along is None or not sensor.sensor:
             return np.zeros(SENSOR_SIZE, bool)
@@ -156,7 +153,7 @@ class NoiseLearner:
         return np.asarray(off > sensor.doubt * np.hypot(measured.sensor_sigma, prior))
 
     def used(self, settings: MapperSettings) -> RunNoise:
-        """Return the noise used, and what sets the size of the map where ranges and speeds disagree."""
+        """Return the noise in use, and the reading that sets the map's size if ranges and speeds disagree."""
         measured, known = self.measured, self.known
         size: Literal["odometry", "ranges"] | None = None
         if self._contradicted(settings)[SCALE]:
@@ -167,10 +164,10 @@ class NoiseLearner:
         return RunNoise(odometry, detections, measured, size)
 
     def trusts_odometry(self, settings: MapperSettings) -> bool:
-        """Return whether the odometry sets the size of the map, by default where its scale is better known.
+        """Whether the odometry sets the size of the map; by default if its scale is better known.
 
-        A sensor's systematic errors are as large as its scatter, or larger: so the scale of ranges is known
-        as well as a range is.
+        Systematic errors of a sensor are at least as large as its noise, so the scale of its ranges is known
+        no better than a single range.
         """
         measured, trust = self.measured, settings.calibration.trust
         if trust is not None or measured is None or measured.along is None:
@@ -180,7 +177,7 @@ class NoiseLearner:
 
 
 def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
-    """Return where noise comes from that is stated or not, is to be measured or not, and is known or not."""
+    """Return the source of noise that is `stated` or not, to be `measured`, and measured so far (`known`)."""
     if stated and not (measured and known):
         return "stated"
     return "measured" if known else "assumed"
@@ -189,14 +186,14 @@ def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
 def begun(
     cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None, *, of_lines: bool
 ) -> Measurement | LineMeasurement | None:
-    """Begin to measure the noise of cones or of lines; None where not even the odometry's can be told."""
+    """Start a measurement on cones or on lines; None if not even the odometry's noise can be estimated."""
     return (LineMeasurement if of_lines else Measurement).of(cycles, twists, known)
 
 
 def measure(
     cycles: Sequence[SeenCycle], twists: TwistRecord, *, of_lines: bool = False
 ) -> MeasuredNoise | None:
-    """Return the noise that the readings show, of cones or of lines; None where none can be told."""
+    """Measure the noise of cones or of lines; None if not even the odometry's noise can be estimated."""
     measurement = begun(cycles, twists, None, of_lines=of_lines)
     if measurement is None:
         return None

@@ -1,20 +1,20 @@
-"""Scan matching: the detections of a cycle are laid on those of the cycles just before.
+"""Scan matching: register the detections of a cycle to those of the previous cycles.
 
-No cone needs an identity: each detection is drawn to the weighted mean of the earlier ones beside it, and the
-weights sharpen from iteration to iteration (EM-ICP; Granger and Pennec 2002).
+Cones need no identity: each detection is registered to the weighted mean of nearby earlier ones, and the
+weights sharpen with each iteration (EM-ICP; Granger and Pennec 2002).
 
-Matches also tell how much the sensor is turned, and how late it is. One turned by psi sees each motion turned
-by -psi. Detections that are late by tau lie too far ahead by `tau v`, which changes of the velocity show.
+Matches also reveal yaw and latency of the sensor. A sensor turned by psi observes each motion turned by -psi.
+Detections with a latency tau lie `tau v` too far ahead, which is observable when the velocity changes.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import IntegratedOdometry
@@ -56,10 +56,10 @@ MISFIT_RATIO: Final = 1.3  # least ratio of that misfit to the one of the match
 
 
 class Seen(NamedTuple):
-    """Detections of a cycle as they are matched."""
+    """Detections of a cycle, prepared for a match."""
 
     points: Array  # (m, 2) corrected, vehicle frame (m)
-    variances: Array  # (m,) of one coordinate (m^2)
+    variances: Array  # (m,) variance of one coordinate (m^2)
     is_line: BoolArray  # (m,) whether they are points of a line
 
     def where(self, chosen: BoolArray) -> "Seen":
@@ -69,20 +69,16 @@ class Seen(NamedTuple):
 _TINY: Final = float(np.finfo(float).tiny)
 
 
-class RecentDetections:
-    """Detections of the newest cycles in one frame."""
+class RecentDetections(Copyable):
+    """Detections of the newest cycles, in the frame of dead reckoning."""
 
     def __init__(self) -> None:
         self.points: Array = np.zeros((0, 2))  # (n, 2) place of each detection, m
         # a row is [stamp | point as measured | place of the vehicle | derivatives of x | derivatives of y]
         self._table: Array = np.zeros((0, 5 + 2 * len(LEARNED_ERRORS)))
 
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
-
     def add(self, t: float, measured: Array, columns: Array, pose: Array) -> None:
-        """Add detections (m, 2) at t (s) from a pose (3,), and their derivatives (m, 2, e) by errors."""
+        """Add detections (m, 2) at t (s) from a pose (3,), and their derivatives (m, 2, e) by the errors."""
         new = np.empty((len(measured), self._table.shape[1]))
         new[:, 0], new[:, 1:3], new[:, 3:5] = t, to_map(measured, pose[None]), pose[:2]
         new[:, 5:] = (rotation(pose[2]) @ columns).reshape(len(measured), new.shape[1] - 5)
@@ -90,7 +86,7 @@ class RecentDetections:
         self.points = self._table[:, 1:3]
 
     def correct(self, errors: Array) -> None:
-        """Put the detections where they are if the sensor has these errors (e,)."""
+        """Correct the detections for sensor errors (e,)."""
         columns = self._table[:, 5:].reshape(len(self._table), 2, len(errors))
         self.points = self._table[:, 1:3] + columns @ errors
 
@@ -101,23 +97,23 @@ class RecentDetections:
 
     @property
     def seen_from(self) -> Array:
-        """Mean place (2,) from which the detections were seen."""
+        """Mean position (2,) from which the detections were seen."""
         return np.asarray(self._table[:, 3:5].sum(axis=0) / len(self._table))
 
     def has(self, points: Array) -> BoolArray:
-        """Return whether each point (m, 2) lies where an earlier detection does."""
+        """Whether each point (m, 2) coincides with earlier detections."""
         return np.asarray(kernels.weighted_means(points, self.points, REACH_LAST, FARTHEST)[1] > MIN_WEIGHT)
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Pose that lays detections on earlier ones."""
+    """Registration of detections to earlier ones."""
 
     pose: Array  # (3,) in the frame of the earlier detections, m, m and rad
     information: Array  # (3, 3) information about the pose from the matched detections, same frame
-    is_matched: BoolArray  # (m,) whether each detection lies on earlier ones
+    is_matched: BoolArray  # (m,) whether each detection coincides with earlier ones
     misfit: float  # mean square of the matched detections' whitened distances
-    by_lines: bool = False  # whether lines are among them, which tell nothing along themselves
+    by_lines: bool = False  # whether points of lines are among them
 
     @property
     def matched(self) -> int:
@@ -125,7 +121,7 @@ class Match:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the detections hold the pose in every direction."""
+        """Whether the detections constrain the pose in every direction."""
         if self.by_lines:
             return bool(np.linalg.inv(self.information)[2, 2] < HEADING_TOLD**2)
         (w, _, a), (_, _, b), (_, _, turning) = self.information.tolist()  # of x and y: w times the identity
@@ -135,11 +131,11 @@ class Match:
 def match(
     recent: RecentDetections, points_vehicle: Array, variances: Array, start: Array, reaches: Sequence[float]
 ) -> Match:
-    """Lay detections (m, 2), vehicle frame, on the recent ones by Gauss-Newton steps from a pose (3,).
+    """Register detections (m, 2), vehicle frame, to the recent ones by Gauss-Newton steps from a pose (3,).
 
-    Each step, one for each of the reaches (m), minimizes `sum_i |R z_i + t - m_i|^2 / sigma_i^2`, m_i being
-    the weighted mean of the recent detections beside the point, and `sigma_i^2 = variance_i (1 + 1/n_i) +
-    SIGMA_CONE^2` with n_i the sum of the weights. The variances (m,) are those of one coordinate (m^2).
+    Each step, one for each of the reaches (m), minimizes `sum_i |R z_i + t - m_i|^2 / sigma_i^2`. m_i is the
+    weighted mean of the recent detections near the point, n_i the sum of the weights, and `sigma_i^2 =
+    variance_i (1 + 1/n_i) + SIGMA_CONE^2`. The variances (m,) are per coordinate (m^2).
     """
     limits = (FARTHEST, MIN_WEIGHT, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED, LEAST_SHARE)
     pose, information, matched, cost = kernels.matched(
@@ -149,7 +145,7 @@ def match(
 
 
 def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array, pose: Array) -> float:
-    """Return the mean square of the whitened distances as `match` has them, at a pose (3,) that is given."""
+    """Return the mean square of the whitened distances of `match` at a given pose (3,)."""
     points = to_map(points_vehicle, pose[None])
     means, weights = kernels.weighted_means(points, recent.points, REACH_LAST, FARTHEST)
     matched = weights > MIN_WEIGHT
@@ -164,14 +160,14 @@ MATCH_LIMITS: Final = Limits(FARTHEST, MIN_WEIGHT, SCAN_HUBER, SIGMA_CONE, MIN_M
 def match_with_lines(
     recent: RecentDetections, lines: RecentDetections, seen: Seen, start: Array, reaches: Sequence[float]
 ) -> Match:
-    """Lay detections on recent ones, of cones and of lines, from a pose (3,)."""
+    """Register detections of cones and of lines to recent ones, from an initial pose (3,)."""
     points = recent.points, lines.points
     pose, information, matched, square = match_lines(points, seen, start, reaches, MATCH_LIMITS)
     return Match(pose, information, matched, square / max(int(matched.sum()), 1), by_lines=True)
 
 
 def misfit_with_lines(recent: RecentDetections, lines: RecentDetections, seen: Seen, pose: Array) -> float:
-    """Return the mean square of the whitened distances as `match_with_lines` has them, at a pose (3,)."""
+    """Return the mean square of the whitened distances of `match_with_lines` at a given pose (3,)."""
     square, matched = squares_at((recent.points, lines.points), seen, pose, REACH_LAST, MATCH_LIMITS)
     square = np.where(matched, square, MOST_MISFIT)
     return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
@@ -181,7 +177,7 @@ def misfit_with_lines(recent: RecentDetections, lines: RecentDetections, seen: S
 
 
 def by_errors(points_vehicle: Array, twist: Array) -> Array:
-    """Return the derivatives (m, 2, 2) of detections (m, 2), vehicle frame, by the yaw and by the latency."""
+    """Return the derivatives (m, 2, 2) of detections (m, 2), vehicle frame, by yaw and latency."""
     columns = np.empty((len(points_vehicle), 2, len(LEARNED_ERRORS)))
     columns[:, :, 0] = left_of(points_vehicle)
     columns[:, :, 1] = -twist[:2] - twist[2] * columns[:, :, 0]
@@ -190,19 +186,19 @@ def by_errors(points_vehicle: Array, twist: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """Distance of a match of detections from the odometry, in the vehicle frame."""
+    """Difference of a match from the odometry, in the vehicle frame."""
 
     off: Array  # (3,) m, m and rad
     covariance: Array  # (3, 3) its covariance, for a sensor without errors
-    shifts: Array  # (3, 2) its derivatives by the errors of the sensor
+    shifts: Array  # (3, 2) its derivatives by the sensor errors
 
 
-class SensorErrors:
-    """Kalman filter of the errors e = (yaw, latency) of the sensor, in rad and s.
+class SensorErrors(Copyable):
+    """Kalman filter of the sensor errors e = (yaw, latency), in rad and s.
 
-    Detections are corrected by the mean. What is left shifts a match, in the vehicle frame, by `(d_y, -d_x,
-    0)` (yaw) and `mean v - v` (latency). d is the way from the mean place from which the remembered
-    detections were seen, v the velocity, and mean v that while they were seen.
+    Detections are corrected by the mean. A remaining yaw shifts a match, in the vehicle frame, by
+    `(d_y, -d_x, 0)`, and a latency by `mean(v) - v`. d is the displacement from the mean position of the
+    poses of the remembered detections, v the velocity, and mean(v) its mean over these poses.
     """
 
     def __init__(self, settings: MotionSettings) -> None:
@@ -212,12 +208,8 @@ class SensorErrors:
         self._velocity: Array = np.zeros(3)
         self._possible: Array = 0.5 * SCAN_MEMORY * np.array(settings.accelerations)
 
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
-
     def contradict(self, settings: CalibrationSettings) -> bool:
-        """Return whether the errors contradict the sensor's prior, by `settings.doubt` sigmas."""
+        """Whether the errors contradict the sensor's prior by more than `settings.doubt` sigmas."""
         if not settings.sensor:
             return False
         limit, prior = settings.doubt**2, (settings.sigma_yaw, settings.sigma_latency)
@@ -225,16 +217,16 @@ class SensorErrors:
         return any(mean**2 > limit * (variance + sigma**2) for mean, variance, sigma in known)
 
     def found(self, settings: CalibrationSettings) -> CalibrationSettings:
-        """Return wide priors of the sensor about the yaw and the latency that matches show.
+        """Return wide priors of the sensor with the learned yaw and latency as means.
 
-        About zero they leave most of a yaw of some degrees to the bias of the yaw rate, which bends the map.
-        The first matches find about half of a large yaw (`SIGMAS_ERRORS`), so its sigma is as large.
+        With zero means, the bias of the yaw rate absorbs most of a yaw of some degrees and bends the map. The
+        first matches find about half of a large yaw (`SIGMAS_ERRORS`), so its sigma is as large.
         """
         (yaw, latency), wide = self.mean.tolist(), settings.widened()
         return replace(wide, yaw=yaw, latency=latency, sigma_yaw=max(wide.sigma_yaw, abs(yaw)))
 
     def follow(self, velocity: Array, dt: float) -> None:
-        """Take the velocity (3,) of a cycle, which lasted for dt (s), over into the mean velocity."""
+        """Update the mean velocity with that of a cycle (3,) of duration dt (s)."""
         share = min(dt / (0.5 * SCAN_MEMORY), 1.0)
         self._velocity = self._velocity + share * (velocity - self._velocity)
 
@@ -246,16 +238,17 @@ class SensorErrors:
         return kernels.squared(difference.off, difference.covariance, difference.shifts, self.covariance)
 
     def shifts(self, way: Array, velocity: Array) -> Array:
-        """Return the derivatives (3, 2) of how far a match is off the odometry, by the errors.
+        """Return the derivatives (3, 2) of the difference between match and odometry by the errors.
 
-        Way (2,) and velocity (3,) are in the vehicle frame; changes that no vehicle makes are slip.
+        The displacement `way` (2,) and the velocity (3,) are in the vehicle frame. Changes of the velocity
+        are clipped to what a vehicle can do; the rest is slip.
         """
         off = np.minimum(np.maximum(self._velocity - velocity, -self._possible), self._possible)
         (ahead, left), (x, y, turn) = way.tolist(), off.tolist()
         return np.array([[left, x], [-ahead, y], [0.0, turn]])
 
     def update(self, difference: Difference, dt: float) -> None:
-        """Learn from a match that agrees, dt (s) after the last; it counts by its share of memory."""
+        """Update with an agreeing match, dt (s) after the previous one, weighted by `dt / SCAN_MEMORY`."""
         measured = difference.off, difference.covariance, difference.shifts, min(dt / SCAN_MEMORY, 1.0)
         self.mean, self.covariance = kernels.learned(self.mean, self.covariance, dt * self._drift, *measured)
 
@@ -263,33 +256,26 @@ class SensorErrors:
 # --- matches of each cycle -------------------------------------------------------------------------------
 
 
-class ScanMatcher:
-    """Matches of each cycle with the newest ones, and what they show of the sensor and its noise."""
+class ScanMatcher(Copyable):
+    """Matching of each cycle with the previous ones, and sensor errors and noise learned from it."""
 
     def __init__(self, settings: MotionSettings) -> None:
         self._settings = settings
         self._misfit = 1.0  # mean of those of the matches that agreed, the newest counting most
         self.forget()
 
-    def copy(self) -> Self:
-        """Return a copy that goes on independently."""
-        other = shallow(self)
-        other.recent, other.recent_lines = self.recent.copy(), self.recent_lines.copy()
-        other.errors = self.errors.copy()
-        return other
-
     def forget(self) -> None:
-        """Forget the newest cycles, and what was learned of the sensor."""
+        """Forget the remembered cycles and the learned sensor errors."""
         self.recent, self.errors = RecentDetections(), SensorErrors(self._settings)
         self.recent_lines = RecentDetections()
 
     @property
     def excess(self) -> float:
-        """Factor by which the variance of detections is larger than they claim; at least 1."""
+        """Ratio of the actual variance of detections to the claimed one; at least 1."""
         return max(self._misfit / LARGE_MISFIT, 1.0)
 
     def corrected(self, detections: Detections, twist: Array, is_line: BoolArray) -> Seen:
-        """Return a cycle's detections by the errors of the sensor, and correct the remembered ones."""
+        """Correct a cycle's detections, and the remembered ones, for the sensor errors."""
         measured, covariances = detections.points_vehicle, detections.covariances
         for recent in (self.recent, self.recent_lines):
             if len(recent.points):
@@ -299,7 +285,7 @@ class ScanMatcher:
         return Seen(points, 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1]), is_line)
 
     def remember(self, detections: Detections, twist: Array, pose: Array, is_line: BoolArray) -> None:
-        """Remember a cycle that was seen from a pose (3,), in motion by a twist (3,)."""
+        """Remember the detections of a cycle with a pose (3,) and a twist (3,)."""
         measured = detections.points_vehicle
         columns = by_errors(measured, twist)
         for recent, chosen in ((self.recent, ~is_line), (self.recent_lines, is_line)):
@@ -307,7 +293,7 @@ class ScanMatcher:
                 recent.add(detections.t, measured[chosen], columns[chosen], pose)
 
     def has(self, seen: Seen, pose: Array) -> BoolArray:
-        """Return whether each detection (m,), from a pose (3,), lies where an earlier one does."""
+        """Whether each detection (m,), seen from a pose (3,), coincides with earlier ones."""
         placed, again = to_map(seen.points, pose[None]), np.zeros(len(seen.points), bool)
         again[~seen.is_line] = self.recent.has(placed[~seen.is_line])
         lines = self.recent_lines.points
@@ -316,7 +302,7 @@ class ScanMatcher:
         return again
 
     def match(self, seen: Seen, start: Array, reaches: Sequence[float]) -> Match | None:
-        """Return the match of detections from a pose (3,), unless it leaves the pose open."""
+        """Return the match of detections from an initial pose (3,); None if the pose is not observable."""
         if seen.is_line.any():
             matched = match_with_lines(self.recent, self.recent_lines, seen, start, reaches)
         else:
@@ -324,27 +310,27 @@ class ScanMatcher:
         return matched if matched.matched >= MIN_MATCHED and matched.is_certain else None
 
     def difference(self, matched: Match, odometry: IntegratedOdometry, predicted: Array) -> Difference:
-        """Return how far a match is from the pose (3,) that odometry predicts, in the vehicle's frame."""
+        """Return the difference of a match from the pose (3,) predicted by odometry, in the vehicle frame."""
         known = matched.pose, matched.information, self.excess, predicted, odometry.covariance
         recent = self.recent_lines if matched.by_lines else self.recent
         way = rotation(predicted[2]).T @ (predicted[:2] - recent.seen_from)
         return Difference(*kernels.off_prediction(*known), self.errors.shifts(way, odometry.twist))
 
     def denies(self, matched: Match, difference: Difference, limit: float) -> bool:
-        """Return whether a match is more than `limit` sigmas off the odometry."""
+        """Whether a match contradicts the odometry by more than `limit` sigmas."""
         return matched.matched >= MIN_DOUBTING and self.errors.square_of(difference) > limit**2
 
     def agree(self, matched: Match, difference: Difference, dt: float) -> None:
-        """Learn from a match that agrees with the odometry, dt (s) after the cycle before."""
+        """Learn from a match that agrees with the odometry, dt (s) after the previous cycle."""
         self._misfit += MISFIT_GAIN * (matched.misfit - self._misfit)
         self.errors.update(difference, dt)
 
     def fits(self, matched: Match) -> bool:
-        """Return whether the misfit of a match is that of a motion."""
+        """Whether the misfit of a match is small enough for a motion."""
         return matched.misfit < MAX_MISFIT * self.excess
 
     def fits_better(self, matched: Match, predicted: Array, seen: Seen) -> bool:
-        """Return whether detections fit badly at the predicted pose (3,), and clearly better at the match."""
+        """Whether detections fit badly at the predicted pose (3,), and clearly better at the match."""
         chosen = seen.where(matched.is_matched)
         at_odometry, at_match = (
             misfit_with_lines(self.recent, self.recent_lines, chosen, pose)

@@ -1,16 +1,16 @@
-"""The side of each detection: what is left of the way driven is left, and colours are evidence of it.
+"""The side of each detection, by the driven path and by colours.
 
-A detector may have no colours, and a track may be driven the other way round. The coloured cones beside the
-path decide together what colours mean. Where most have none, two rows of cones are followed from beside the
-vehicle ahead, each cone to the row that it fits better.
+A detector may have no colours, and a track may be driven in reverse. A vote of the coloured cones beside the
+path decides whether colours are swapped. If most detections have no colour, two rows of cones are extended
+from beside the vehicle, and each cone gets the side of the row that it fits better.
 """
 
 from dataclasses import replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.cone_rows import ConeRow, deal_out
@@ -20,52 +20,46 @@ from pathspace_graph.mapping.path import LATERAL_GAP, ROW_BESIDE, SIDES, DrivenP
 from pathspace_graph.mapping.tentative import nearest_within, newest_of
 from pathspace_graph.settings.online import SidesSettings
 
-VOTE_REACH: Final = 8.0  # length of the predicted path beside which cones say what the colours mean, m
-NEAREST_SIDE: Final = 0.5
-FARTHEST_SIDE: Final = 8.0  # distances from the path between which it tells the side of a cone, m
-MAJORITY: Final = 2.5  # least ratio of cones on the other colour's side where colours are swapped
-MIN_VOTES: Final = 3  # least number of cones on the other colour's side where colours are swapped
-ENOUGH_VOTES: Final = 30  # number of cones that settles what the colours mean
-REMEMBERED: Final = 0.98  # factor from cycle to cycle of the detections so far in the colourless share
-MIN_SHARED: Final = 6  # least number of detections of which the share is taken
-MERGE_RADIUS: Final = 1.0  # distance within which detections are of one cone, m
-FORGET_AFTER: Final = 3.0  # time without a detection after which a cone is forgotten, s
-MOST_CONES: Final = 2000  # largest number of cones that are remembered, the ones that were seen last
-SIDED_FROM: Final = 2  # detections from which a cone has a side
-BEHIND: Final = 8.0  # length behind the vehicle at which the rows begin, m along the path
-PATH_TELLS: Final = 3.0  # length ahead of it up to which the path tells sides, m; beyond, the rows do
-HALF_WIDTH: Final = 1.5  # distance beside the vehicle at which a row without any cone begins, m
+VOTE_REACH: Final = 8.0  # length of the predicted path beside which cones vote (m)
+NEAREST_SIDE: Final = 0.5  # least distance from the path of a cone whose side the path determines (m)
+FARTHEST_SIDE: Final = 8.0  # largest such distance (m)
+MAJORITY: Final = 2.5  # least ratio of votes that swaps the colours
+MIN_VOTES: Final = 3  # least number of votes that swaps the colours
+ENOUGH_VOTES: Final = 30  # number of votes after which the meaning of the colours is final
+REMEMBERED: Final = 0.98  # forgetting factor per cycle of the share without colour
+MIN_SHARED: Final = 6  # least number of detections for that share
+MERGE_RADIUS: Final = 1.0  # distance within which detections are merged to one cone (m)
+FORGET_AFTER: Final = 3.0  # time without a detection after which a cone is forgotten (s)
+MOST_CONES: Final = 2000  # largest number of remembered cones
+SIDED_FROM: Final = 2  # least number of detections of a cone with a side
+BEHIND: Final = 8.0  # distance behind the vehicle at which rows begin (m along the path)
+PATH_TELLS: Final = 3.0  # distance ahead up to which the path determines sides (m); the rows do beyond
+HALF_WIDTH: Final = 1.5  # distance beside the vehicle at which a row without cones begins (m)
 
 
-class SideJudge:
-    """Judge of the side of each detection, which gives it the label."""
+class SideJudge(Copyable):
+    """Estimator of the side of each detection, which is its label."""
 
     def __init__(self, settings: SidesSettings) -> None:
         self.settings = settings
-        self.swapped = False  # whether the colours of the log so far are on the other sides
+        self.swapped = False  # whether the colours of the log are swapped
         self.colourless = False  # whether most detections have no colour
         self._path: DrivenPath | None = None
         self._cones = NearCones()
-        self._agreeing = self._opposing = 0  # cones on the side of their colour, and on the other one
-        self._known = self._unknown = 0.0  # newest detections with and without a colour
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently."""
-        other = shallow(self)
-        other._path, other._cones = self._path and shallow(self._path), self._cones.copy()
-        return other
+        self._agreeing = self._opposing = 0  # votes of cones on the side of their colour, and on the other
+        self._known = self._unknown = 0.0  # detections with and without a colour, with forgetting
 
     def update(
         self, pose: Array, twists: Array, detections: Detections, *, in_lane: bool = False
     ) -> Detections:
-        """Return the detections of a cycle with the labels of their sides.
+        """Return the detections of a cycle, labelled by side.
 
-        The vehicle came to the pose (3,), front end's frame, with twists (k, 3). In a lane of orange cones
-        it isn't on the road yet, and the colours of others prove nothing.
+        The pose (3,) is by dead reckoning, and the twists (k, 3) lead to it. In a lane of orange cones the
+        vehicle is not on the track yet, and colours get no vote.
         """
         labels, self.colourless = detections.labels, self._is_colourless(detections.labels)
         if not self.colourless and self._agreeing + self._opposing >= ENOUGH_VOTES:
-            self._path = None  # it begins anew, if it is needed again
+            self._path = None  # a new path begins if it is needed again
             return self.relabelled(detections, labels) if self.swapped else detections
         self._path = self._path or DrivenPath()
         self._path.update(pose)
@@ -79,14 +73,14 @@ class SideJudge:
         return self.relabelled(detections, sides)
 
     def relabelled(self, detections: Detections, sides: IntArray) -> Detections:
-        """Return detections with the right colours, and with sides (m,) for those that have none."""
+        """Swap colours if necessary, and label detections without a colour by sides (m,)."""
         labels = detections.labels
         coloured = LEFT + RIGHT - labels if self.swapped else labels
         labels = np.where(labels == UNKNOWN, sides, coloured)
         return detections if (labels == detections.labels).all() else replace(detections, labels=labels)
 
     def _judge_colours(self, path: PathAhead) -> None:
-        """Count cones once on the side of their colour or the other one, and swap colours by majority."""
+        """Count the vote of each cone once, and swap colours by majority."""
         near = self._cones
         fresh = np.flatnonzero(~near.judged & near.votes.any(axis=1))
         if len(fresh) == 0:
@@ -121,7 +115,7 @@ class SideJudge:
         rows = [self._beginning(label, pose, path, seen, stations, lateral) for label in BOUNDARIES]
         free = np.setdiff1d(seen[stations > path.driven], [*rows[0].chosen, *rows[1].chosen])
         votes = near.votes[free, ::-1] if self.swapped else near.votes[free]
-        deal_out(rows, free, votes.T[::-1] <= votes.T + 1)  # one wrong colour excludes no cone
+        deal_out(rows, free, votes.T[::-1] <= votes.T + 1)  # a single wrong colour excludes no cone
         for label, row in zip(BOUNDARIES, rows, strict=True):
             sides[row.chosen] = label
         return sides
@@ -129,7 +123,7 @@ class SideJudge:
     def _beginning(
         self, label: int, pose: Array, path: PathAhead, seen: IntArray, stations: Array, lateral: Array
     ) -> ConeRow:
-        """Return the row of a boundary up to the vehicle, through the cones (k,) that were seen."""
+        """Return the row of a boundary up to the vehicle, through the cones `seen` (k,), by index."""
         side = SIDES[label] * lateral
         beside = (side > NEAREST_SIDE) & (side < FARTHEST_SIDE)
         beside &= (stations > path.driven - BEHIND) & (stations < path.driven + PATH_TELLS)
@@ -145,22 +139,18 @@ class SideJudge:
         return ConeRow(SIDES[label], line, ahead, candidates, cones.tolist())
 
 
-class NearCones:
-    """Cones near the vehicle as means of their detections, with the colours in which they were seen."""
+class NearCones(Copyable):
+    """Cones near the vehicle, as means of their detections, with their colours."""
 
     def __init__(self) -> None:
-        self.points: Array = np.zeros((0, 2))  # (n, 2) place of each cone in the frame of the front end, m
+        self.points: Array = np.zeros((0, 2))  # (n, 2) positions by dead reckoning (m)
         self.counts: IntArray = np.zeros(0, np.intp)  # (n,) number of detections
         self.votes: IntArray = np.zeros((0, len(BOUNDARIES)), np.intp)  # (n, 2) detections by label
-        self.judged: BoolArray = np.zeros(0, bool)  # (n,) whether its colour was compared with its side
-        self._last: Array = np.zeros(0)
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: arrays that are written into are new in each call."""
-        return shallow(self)
+        self.judged: BoolArray = np.zeros(0, bool)  # (n,) whether the cone has voted
+        self._last: Array = np.zeros(0)  # (n,) stamp of the newest detection (s)
 
     def add(self, t: float, points: Array, labels: IntArray) -> IntArray:
-        """Add detections at points (m, 2) with labels (m,), seen at t (s); return the cone (m,) of each."""
+        """Merge detections at points (m, 2) with labels (m,) and a stamp t (s); return their cones (m,)."""
         kept = newest_of(self._last, MOST_CONES) & (self._last > t - FORGET_AFTER)
         for name, column in vars(self).items():
             setattr(self, name, column[kept])
@@ -177,6 +167,6 @@ class NearCones:
         return cones
 
     def judge(self, cones: IntArray) -> None:
-        """Note that the colours of cones (k,) were compared with their sides."""
+        """Mark cones (k,) as having voted."""
         self.judged = self.judged.copy()
         self.judged[cones] = True

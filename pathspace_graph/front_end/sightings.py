@@ -1,46 +1,46 @@
-"""Sightings of cones, followed by dead reckoning, and the twists of a drive: what noise is measured from."""
+"""Input of noise measurement: sightings of cones tracked by dead reckoning, and the twists of a drive."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from math import comb
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import left_of, to_map
 from pathspace_graph.io.log import Detections, Odometry
 
-MAD: Final = 1.4826  # standard deviation of a Gaussian by its median absolute deviation
-MOST_TWISTS: Final = 4000
-MOST_PARTS: Final = 200
-MIN_SPEED_SHARE: Final = 0.3  # share of its median speed below which a vehicle says little of noise in motion
-MIN_TWISTS: Final = 30  # least number of twists that tell white noise
-FOLLOW_RANGE: Final = 30.0  # m; beyond, cones are hardly ever seen near later
-MAX_AGE: Final = 3.0  # time without a sighting after which a cone counts as another one (s)
-GATE_UNKNOWN: Final = (0.4, 0.06, 1.5)  # of the nearest cone while noise is unknown: `min(a + b r, c)`, m
-FOLLOWING: Final = (0.5, 0.15)  # of a cone to where it is seen, and was seen from nearer before
-GATE_SIGMAS: Final = 3.5
-GATE_LEAST: Final = 0.4
-GATE_MOST: Final = 3.5  # of the gate once noise is known: sigmas along and across the ray; least, most, m
+MAD: Final = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
+MOST_TWISTS: Final = 4000  # largest number of newest twists
+MOST_PARTS: Final = 200  # number of stored cycles after which these are reduced to the newest twists
+MIN_SPEED_SHARE: Final = 0.3  # least share of the median speed for the noise in motion
+MIN_TWISTS: Final = 30  # least number of twists for white noise
+FOLLOW_RANGE: Final = 30.0  # largest range of a tracked cone (m): few cones beyond are seen from near later
+MAX_AGE: Final = 3.0  # time without a sighting after which a track ends (s)
+GATE_UNKNOWN: Final = (0.4, 0.06, 1.5)  # gate `min(a + b r, c)` (m) at range r while noise is unknown
+FOLLOWING: Final = (0.5, 0.15)  # gains by which a track moves to a sighting: from nearer, and from farther
+GATE_SIGMAS: Final = 3.5  # gate along and across the ray (sigmas) once noise is known
+GATE_LEAST: Final = 0.4  # least gate (m)
+GATE_MOST: Final = 3.5  # largest gate (m)
 
 Cones = tuple[Array, IntArray, Array, Array, IntArray]
-"""Place (k, 2) of each cone that is followed, its label (k,), least range, latest stamp and number."""
+"""Position (k, 2) of each tracked cone, its label (k,), least range, newest stamp and number."""
 
 
 @dataclass(eq=False)
 class Sightings:
-    """Columns of sightings of cones, in order of time."""
+    """Table of sightings of cones, in order of time."""
 
     cone: IntArray  # (n,) number of the cone
     t: Array  # (n,) stamp (s)
-    point: Array  # (n, 2) detection as measured (m), vehicle frame
-    twist: Array  # (n, 3) twist of the vehicle then: m/s, m/s, rad/s
-    pose: Array  # (n, 3) pose of the vehicle by dead reckoning
-    by_bias: Array  # (n, 3) derivative of that pose by the bias of the yaw rate
+    point: Array  # (n, 2) measured point in m, vehicle frame
+    twist: Array  # (n, 3) twist of the vehicle (m/s, m/s, rad/s)
+    pose: Array  # (n, 3) pose by dead reckoning
+    by_bias: Array  # (n, 3) derivative of the pose by the bias of the yaw rate
 
     @classmethod
     def none(cls) -> "Sightings":
@@ -56,17 +56,17 @@ class Sightings:
 
 @dataclass(frozen=True, eq=False)
 class SeenCycle:
-    """A perception cycle where dead reckoning has placed it."""
+    """A perception cycle with its pose by dead reckoning."""
 
     detections: Detections  # detections as measured
-    pose: Array  # (3,) pose of the vehicle by dead reckoning
-    twist: Array  # (3,) twist of the vehicle: m/s, m/s, rad/s
+    pose: Array  # (3,) pose by dead reckoning
+    twist: Array  # (3,) twist of the vehicle (m/s, m/s, rad/s)
 
 
 def by_bias(t: Array, poses: Array, since: tuple[float, Array, Array] | None = None) -> Array:
     """Return the derivatives (c, 3) of poses (c, 3) at t (c,) by the bias of the yaw rate.
 
-    It acts since a stamp with a pose and its derivative (3,), or since the first pose.
+    `since` is the stamp, pose and derivative (3,) of an earlier cycle, by default the first one.
     """
     stamp, pose, begun = since or (t[0], poses[0], np.zeros(3))
     moved, dt = np.diff(poses[:, :2], axis=0, prepend=pose[None, :2]), np.diff(t, prepend=stamp)
@@ -77,8 +77,8 @@ def by_bias(t: Array, poses: Array, since: tuple[float, Array, Array] | None = N
     return derivatives
 
 
-class ConeTracker:
-    """Cones that were seen in the last seconds, by dead reckoning."""
+class ConeTracker(Copyable):
+    """Tracks of the cones seen in the last seconds, by dead reckoning."""
 
     def __init__(self, known: MeasuredNoise) -> None:
         self._known = known
@@ -87,12 +87,8 @@ class ConeTracker:
         self._count = 0
         self._from: tuple[float, Array, Array] | None = None  # stamp, pose and `by_bias` of the latest cycle
 
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
-
     def follow(self, cycles: Sequence[SeenCycle]) -> Sightings:
-        """Return the sightings of the next cycles as measured, in order of time, the nearest first."""
+        """Track the cones through the next cycles; return the sightings by time and range."""
         if not cycles:
             return Sightings.none()
         poses, twists = np.array([one.pose for one in cycles]), np.array([one.twist for one in cycles])
@@ -116,7 +112,7 @@ class ConeTracker:
         return Sightings(cones[of_cone], t[own], measured[of_cone], twists[own], poses[own], derivatives[own])
 
     def _gates(self, ranges: Array) -> tuple[Array, Array]:
-        """Return how far along and across its ray a detection (m,) may be from its cone (m)."""
+        """Return the gates (m,) along and across the ray of detections at ranges (m,), in m."""
         known = self._known
         if known.along is None or known.across is None:
             round_gate = np.minimum(GATE_UNKNOWN[0] + GATE_UNKNOWN[1] * ranges, GATE_UNKNOWN[2])
@@ -125,15 +121,11 @@ class ConeTracker:
         return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
 
 
-class TwistRecord:
-    """Newest twists that were measured while the vehicle drove."""
+class TwistRecord(Copyable):
+    """The newest measured twists of a drive."""
 
     def __init__(self) -> None:
         self._parts: tuple[Odometry, ...] = ()
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
 
     def add(self, odometry: Odometry) -> None:
         self._parts = (*self._parts, odometry)
@@ -142,7 +134,7 @@ class TwistRecord:
 
     @property
     def _newest(self) -> tuple[Array, Array]:
-        """Return the stamps (n,) and the twists (n, 3); one that only repeats the one before is held."""
+        """Return the stamps (n,) and the twists (n, 3) without repeated ones, which are held."""
         t = np.concatenate([np.zeros(0), *(part.t for part in self._parts)])
         twists = np.concatenate([np.zeros((0, 3)), *(part.twist for part in self._parts)])
         new = np.ones(len(t), bool)
@@ -150,14 +142,15 @@ class TwistRecord:
         return t[new][-MOST_TWISTS:], twists[new][-MOST_TWISTS:]
 
     def white(self) -> tuple[Array, float] | None:
-        """Return the white noise (3,) of a twist, the least of `orders`, and the time between two (s)."""
+        """Return the white noise (3,) of a twist, the least of `orders`, and the interval of twists (s)."""
         orders = self.orders()
         return None if orders is None else (orders.min(axis=0), float(np.median(np.diff(self._newest[0]))))
 
     def orders(self) -> Array | None:
-        """Return the noise (k, 3) of a twist by differences of second to fourth order, if there are enough.
+        """Return the noise (k, 3) of a twist by differences of second to fourth order, or None for too few.
 
-        The median absolute difference over `sqrt(binomial(2 k, k))`; it is not white where orders differ.
+        The noise by order k is the scaled median absolute difference over `sqrt(binomial(2 k, k))`. The noise
+        is not white if orders disagree.
         """
         _, twists = self._newest
         if len(twists) < MIN_TWISTS:

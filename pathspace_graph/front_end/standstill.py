@@ -1,52 +1,48 @@
-"""Rest by cones: the vehicle stands although its odometry moves on.
+"""Standstill by cones: the vehicle stands although its odometry moves.
 
-The filter of an inertial system may creep for seconds after a stop, too slowly for one cycle to show. So all
-cycles of the last second are laid on each other, as if the vehicle stood and as the odometry moves it. Where
-nothing is seen of the motion, as between walls, both fit alike, and the odometry is believed.
+The filter of an inertial system may creep for seconds after a stop, too slowly for a single cycle to show. So
+all cycles of the last second are compared under two hypotheses: standstill, and motion by odometry. If both
+fit equally well, as between walls, the odometry is trusted.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, move_points, relative
 
 from .scan_matching import MOST_MISFIT, SIGMA_CONE
 
-COMPARED: Final = 1.0  # age of the cycles that are compared, s
-CREEP: Final = 3.0  # speed above which no odometry creeps, m/s; wheels that spin contradict single cycles
+COMPARED: Final = 1.0  # largest age of a compared cycle (s)
+CREEP: Final = 3.0  # largest speed of creep (m/s); a single cycle contradicts spinning wheels
 HYPOTHESES: Final = (0.0, 0.25, 0.5, 1.0)
-"""Hypotheses as shares of the odometry's motion: rest, slip and the odometry itself."""
-CHANCE: Final = 4.5  # gain from which points of a line do not fit by chance, sigmas by its own scatter
-NOWHERE: Final = np.full((1, 2), 1e6)  # a point that is near none, so that no cycle is empty
+"""Hypotheses, as shares of the odometry's motion: standstill, slip, and the odometry itself."""
+CHANCE: Final = 4.5  # least gain (sigmas of its scatter): points of a line fit by chance below
+NOWHERE: Final = np.full((1, 2), 1e6)  # point far from all others, so that no cycle is empty
 
 
 @dataclass(frozen=True, eq=False)
 class _Cycle:
-    t: float
+    t: float  # stamp (s)
     points: Array  # (n, 2) corrected detections, vehicle frame, and `NOWHERE`
     farthest: float  # largest range of a detection (m)
-    by_odometry: Array  # (3,) pose by the odometry alone
-    pose: Array  # (3,) pose that is believed
-    gains: Array  # (5, k) sums of `_gains` over the newest k cycles before
+    by_odometry: Array  # (3,) pose by odometry alone
+    pose: Array  # (3,) accepted pose
+    gains: Array  # (5, k) cumulative sums of `_gains` over the k previous cycles
 
 
-class Standstill:
-    """Judge of whether the vehicle stands by the cones of the last second."""
+class Standstill(Copyable):
+    """Detection of a standstill by the cones of the last second."""
 
     def __init__(self) -> None:
-        self._cycles: tuple[_Cycle, ...] = ()  # the newest first
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
+        self._cycles: tuple[_Cycle, ...] = ()  # newest first
 
     def add(self, t: float, points: Array, covariances: Array, delta: Array) -> None:
-        """Add corrected detections (n, 2), vehicle frame, at t (s) after a motion (3,) by the odometry."""
+        """Add corrected detections (n, 2), vehicle frame, at t (s) after the motion (3,) by odometry."""
         cycles = self._cycles
         by_odometry = compose(cycles[0].by_odometry, delta) if cycles else np.zeros(3)
         if cycles and np.hypot(delta[0], delta[1]) > CREEP * (t - cycles[0].t):
@@ -59,16 +55,16 @@ class Standstill:
         self._cycles = (newest, *cycles)
 
     def believe(self, pose: Array) -> None:
-        """Note the pose (3,) of the newest cycle that is believed."""
+        """Set the accepted pose (3,) of the newest cycle."""
         self._place(1, pose)
 
     def place(self, limit: float) -> Array | None:
-        """Return the pose (3,) at which the vehicle stands, or None where it may be moving.
+        """Return the pose (3,) at which the vehicle stands, or None if it may move.
 
         Twice the log-likelihood of n cycles is `2 / n` times the sum of the gains of their pairs. The vehicle
-        stands if rest is more likely than the odometry by `limit^2`, and than slip, for some number of the
-        newest cycles: a moving one looks so at `limit` sigmas. The gain must also exceed its scatter, which
-        needs no noise. The poses since are then the first one's.
+        stands if, for some number of newest cycles, twice the log-likelihood ratio of standstill to odometry
+        exceeds `limit^2`, standstill is likelier than slip, and the gain exceeds its scatter. All of these
+        cycles then get the pose of the first one.
         """
         earlier = len(self._cycles) - 1
         sums = np.zeros((len(HYPOTHESES) + 1, earlier))
@@ -86,17 +82,17 @@ class Standstill:
         return pose
 
     def _place(self, count: int, pose: Array) -> None:
-        """Place the newest cycles at a pose (3,)."""
+        """Set the pose (3,) of the `count` newest cycles."""
         placed = (replace(one, pose=pose) for one in self._cycles[:count])
         self._cycles = (*placed, *self._cycles[count:])
 
 
 def _gains(cycles: Sequence[_Cycle], points: Array, covariances: Array, by_odometry: Array) -> Array:
-    """Return the gains of the newest cycle with each other one by hypothesis, and squares of rest's.
+    """Return the gains (5, k) of the newest cycle with k others, a row for each hypothesis.
 
-    The gain of a detection is `max(0, MOST_MISFIT - d^2)`, d being its whitened distance from the nearest
-    one of the other cycle. It has none beyond what the odometry says that the other cycle saw: the view
-    moves with the vehicle, so what is new at its border matches only at rest.
+    The gain of a detection is `max(0, MOST_MISFIT - d^2)` with its whitened distance d from the nearest one
+    of the other cycle. Detections outside the other cycle's view, by odometry, have no gain: the view moves
+    with the vehicle, and its border matches only at standstill. The last row sums (standstill - odometry)^2.
     """
     if not cycles:
         return np.zeros((len(HYPOTHESES) + 1, 0))

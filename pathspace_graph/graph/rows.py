@@ -95,25 +95,13 @@ def at_reference(groups: Sequence[Rows], variables: Variables) -> list[Rows]:
 
 def jacobian_factors(groups: Sequence[Rows], layout: Layout) -> dict[int, gtsam.GaussianConditional]:
     """Return a factor `1/2 |J d + r|^2` by owner, from rows whose unknowns are d, on the keys of its rows."""
-    parts: dict[int, list[Rows]] = {}
-    for unordered in groups:
-        if len(unordered):
-            rows, begin = unordered.where(unordered.owner.argsort(kind="stable")), 0
-            owners, counts = np.unique(rows.owner, return_counts=True)
-            for owner, end in zip(owners.tolist(), counts.cumsum().tolist(), strict=True):
-                parts.setdefault(owner, []).append(rows.where(slice(begin, end)))
-                begin = end
-    return {owner: _factor(parts[owner], layout) for owner in sorted(parts)}
-
-
-def _factor(parts: Sequence[Rows], layout: Layout) -> gtsam.GaussianConditional:
-    """Return the factor of rows on the variables of a layout."""
     try:
-        return factor_of_block(layout, *kernels.block_of(layout, parts))
+        blocks = kernels.blocks_of(layout, groups)
     except ValueError:
-        for rows in parts:
+        for rows in groups:
             layout.places(rows.keys)  # it says which variable is not known
         raise
+    return {owner: factor_of_block(layout, held, block) for owner, held, block in blocks}
 
 
 def factor_of_block(layout: Layout, held: IntArray, block: Array) -> gtsam.GaussianConditional:

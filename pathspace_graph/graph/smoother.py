@@ -14,6 +14,7 @@ import numpy as np
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.linear import keys_of_factor
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
 
@@ -34,9 +35,10 @@ from .gaussian import (
 from .inactive import Attached, InactiveChain, InactiveMap
 from .relative import Submaps
 from .rows import Rows, calibrated_delta, newton_system, predicted_covariance
-from .variables import CALIBRATION_KEY, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys
-from .window import M_co, SmootherSettings, UserFactors, WindowFactors, check_factors
+from .variables import CALIBRATION_KEY, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys, sizes
+from .window import M_co, SmootherSettings, UserFactors, WindowFactors, check_factors, values_of
 
+NO_INFORMATION: Final = 1e-10  # a factor that removes less of a variance than this share says nothing
 TIME_TOLERANCE: Final = 1e-9  # by which a pose must be older than the lag (s), since stamps have round-off
 
 
@@ -140,6 +142,29 @@ class FixedLagSmoother(Generic[M_co]):
 
     def check_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
         check_factors(factors, self.variables, self.next_cycle)
+
+    def informative(self, factors: Sequence[gtsam.NonlinearFactor]) -> list[gtsam.NonlinearFactor]:
+        """Return the user's factors, after their check, without those that say nothing.
+
+        With `A d - b` for a linearized factor and Sigma for the covariance of its variables, it says nothing
+        where `trace(A Sigma A')`, the largest share of a variance that it removes, is next to round-off. Such
+        a factor would still switch off what `add_factors` does. After the first one nothing is left to lose.
+        """
+        if self.user_factors.given:
+            return list(factors)
+        return [one for one in factors if self._information_gain(one) > NO_INFORMATION]
+
+    def _information_gain(self, factor: gtsam.NonlinearFactor) -> float:
+        """Return `trace(A Sigma A')`; the pose of the next cycle counts with a metre and a radian."""
+        linear = factor.linearize(values_of(factor, self.next_cycle, self.variables))
+        if linear is None:
+            return 0.0
+        keys, A = keys_of_factor(linear), np.array(linear.jacobian()[0])
+        is_known = keys != pose_key(self.next_cycle)
+        by_known = A[:, np.repeat(is_known, sizes(keys))]
+        covariance = self.covariance(keys[is_known]) if is_known.any() else np.zeros((0, 0))
+        gain = np.einsum("ij,jk,ik->", by_known, covariance, by_known)
+        return float(gain + (A**2).sum() - (by_known**2).sum())
 
     def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> bool:
         """Add the user's factors on any variables, and on the pose of the next cycle, after their check.

@@ -318,15 +318,16 @@ def check_factors(factors: Sequence[gtsam.NonlinearFactor], variables: Variables
         if len(unknown):
             raise _unusable(row, f"keys of {expected}", name(int(unknown[0])))
         try:
-            linear = factor.linearize(_values_of(keys, following, variables))
+            linear = factor.linearize(values_of(factor, next_cycle, variables))
         except Exception as error:  # whatever a user's own function raises, or GTSAM where types differ
             raise _unusable(row, "a factor that can be linearized", error) from error
         if linear is not None and not all(np.isfinite(part).all() for part in linear.jacobian()):
             raise _unusable(row, "finite numbers", "others where it is linearized")
 
 
-def _values_of(keys: IntArray, following: int, variables: Variables) -> gtsam.Values:
-    """Return the values of known keys; the pose of the next cycle, `following`, is at the newest one."""
+def values_of(factor: gtsam.NonlinearFactor, next_cycle: int, variables: Variables) -> gtsam.Values:
+    """Return the values of a factor's variables; the pose of the next cycle is at the newest one."""
+    keys, following = keys_of_factor(factor), pose_key(next_cycle)
     values = variables.gtsam_values(keys[keys != following])
     if following in keys:
         newest = variables.poses[-1] if len(variables.poses) else np.zeros(POSE)

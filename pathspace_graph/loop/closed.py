@@ -1,9 +1,7 @@
-"""The closed map: it is localized on, refined, and repaired where cones contradict it."""
+"""The closed map: localization, refinement, and repair where cones contradict it."""
 
 from collections.abc import Mapping
-from typing import Self
 
-from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Health
 from pathspace_graph.labels import BOUNDARIES
@@ -12,7 +10,7 @@ from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.spline.boundary import boundaries_cross
 from pathspace_graph.spline.bspline import BSpline
 
-from .closing import hold_gauge
+from .closing import fix_gauge
 from .drive import Drive, Phase, Step
 from .known_loop import KnownLoop, evidence_of
 from .lap_solver import Outcome
@@ -21,30 +19,21 @@ from .map_repair import MapRepair
 from .worker import Unsolved
 
 
-class Closed:
-    """A closed map, and what may have to be done about it."""
-
-    uses_detections = True
+class Closed(Phase):
+    """Refinement and repair of a closed map."""
 
     def __init__(self, road: Road, drive: Drive) -> None:
-        """Begin where the curves have just been closed."""
+        """Start just after the curves were closed."""
         self.map_repair = MapRepair(road.settings)
         self.known_loop = KnownLoop()
         self._boundaries_cross = _crosses(road, drive)
-        self._settled = road.path.length  # path (m) when the map was last replaced
+        self._settled = road.path.length  # path length at the last replacement of the map (m)
         road.growth.clear()
-
-    def copy(self) -> Self:
-        """Return a phase that can go on independently."""
-        other = shallow(self)
-        other.map_repair = self.map_repair.copy()
-        other.known_loop = shallow(self.known_loop)
-        return other
 
     def judge(
         self, road: Road, drive: Drive, classified: Classified, reading: Reading
     ) -> tuple[Phase, Health]:
-        """Judge the estimate and the map by the tested detections; a vehicle may be lost from here on."""
+        """Judge estimate and map by the tested detections; the phase becomes `Lost` for a lost vehicle."""
         smoother, is_whole = road.smoother, road.has_both_boundaries
         known = self.known_loop if is_whole else None
         health = drive.monitor.update(evidence_of(smoother, classified.tested, known, reading))
@@ -55,37 +44,37 @@ class Closed:
             self.map_repair.contradictions.observe(smoother.map, loop, classified.new, reading.detections.t)
         if health.condition != LOST or not is_whole or drive.solver.is_busy:
             return self, health
-        smoother.map.detections.release_all()  # the map stays as it was before
+        smoother.map.detections.release_all()  # they must not change the map
         self.map_repair.contradictions.clear()
         drive.record.give_up("the vehicle was lost")
         return Lost(self, road, health), health
 
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        """Hold the gauge after enough laps, repair the map, and go on from the batch of the repair."""
+        """Fix the gauge after enough laps, repair the map, and apply the batch of a repair."""
         drive.record.estimated(road)
         if drive.rests(road):
             return Step(self)
         if drive.solver.is_busy:
             outcome = drive.outcome(road, spent)
             return Step(self) if outcome is None else self.take(road, drive, outcome)
-        self._hold_gauge(road)
+        self._fix_gauge(road)
         return Step(self, notice=self._repair(road, drive, reading))
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
-        """Go on from a repaired map that explains the contradictions, and is no worse otherwise."""
+        """Apply a repaired map that explains the contradictions and whose boundaries do not newly cross."""
         solved = None if isinstance(outcome, Unsolved) else outcome
         notice = self.map_repair.end(solved)
         if solved is None or not notice or _crosses(road, drive, solved.splines) > self._boundaries_cross:
             return Step(self)
-        jump = drive.go_on_from(road, solved)
+        jump = drive.swap_in(road, solved)
         self._boundaries_cross = _crosses(road, drive)
         self._settled = road.path.length
         return Step(self, jump, notice)
 
     def _repair(self, road: Road, drive: Drive, reading: Reading) -> str:
-        """Send the drive to a batch where cones contradict the map; a known map is repaired at once.
+        """Start a batch of the drive if cones contradict the map; repair a known map in place.
 
-        Return the notice of that.
+        Return the notice of a repair in place.
         """
         t, driven = reading.detections.t, road.path.length
         if not road.has_both_boundaries or not drive.can_repair:
@@ -98,18 +87,18 @@ class Closed:
         self.known_loop = KnownLoop()
         return self.map_repair.in_place(road.smoother)
 
-    def _hold_gauge(self, road: Road) -> None:
-        """Hold the gauge of the map after enough laps, unless factors of the user's may tell it."""
+    def _fix_gauge(self, road: Road) -> None:
+        """Fix the gauge of the map after enough laps, unless user factors may observe it."""
         smoother = road.smoother
         if smoother.user_factors.given or smoother.held is not None:
             return
         longest = max(boundary.length for boundary in road.boundaries.values())
         if road.path.length > self._settled + road.settings.closing.gauge_laps * longest:
-            hold_gauge(smoother)
+            fix_gauge(smoother)
 
 
 def _crosses(road: Road, drive: Drive, splines: Mapping[int, BSpline] | None = None) -> bool:
-    """Return whether both boundaries cross beside the path driven, by default those of the road."""
+    """Whether both boundaries, by default those of the road, cross beside the driven path."""
     if splines is None:
         road.smoother.refresh()
         splines = road.smoother.map.state.splines

@@ -1,10 +1,12 @@
 """Loop closing and simplification (paper: Simplification), and the marginal and gauge of the closed map.
 
-An open road is laid on a known map in the same way: the map is its prior from then on.
+The loop closes by a batch of the lap (`swap_in`). A known map replaces an open road in a similar way
+(`lay_on_known`).
 
-`mapping.registration.register` finds the correspondences between the newest detections and the beginning of
-the curves. `apply_correspondences` moves the window there and associates the detections with the oldest
-control points, `graph.changes:solve_loop` solves the whole loop, and `simplify` makes the curves periodic.
+Without a batch, `mapping.registration.register` finds correspondences between the newest detections and the
+beginning of the curves. `apply_correspondences` moves the window there and associates the detections with the
+oldest control points, `graph.changes:solve_loop` optimizes the whole loop, and `simplify` makes the curves
+periodic.
 """
 
 from dataclasses import dataclass
@@ -29,22 +31,23 @@ from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import curvature_weighted_breaks, refit, thin
 
-EXTRAPOLATED: Final = 2  # knot intervals past the confirmed end that are mapped to the closed curve
-JOIN_MARGIN: Final = 10.0  # length before the end of a curve, and `BEGINNING`, in which the seam lies (m)
-JOIN_SHARE: Final = 0.5  # share of a short curve past which the seam lies
-OVERLAP_STEP: Final = 1.0  # step at which points of the overlap are placed on the beginning (m)
-OVERLAP_ROOM: Final = 4.0  # room about its expected place in which a point of the overlap is searched (m)
-SEAM_MARGIN: Final = 0.5  # distance from the seam below which a cone is one of the beginning (m)
+EXTRAPOLATED: Final = 2  # knot intervals past the confirmed end that map to the closed curve
+JOIN_MARGIN: Final = 10.0  # with `BEGINNING`, largest distance of the seam from the end of a curve (m)
+JOIN_SHARE: Final = 0.5  # least parameter of the seam on a short curve, as a share of its length
+OVERLAP_STEP: Final = 1.0  # step of the points of the overlap (m)
+OVERLAP_ROOM: Final = 4.0  # search range of their foot points on the beginning, about the expected ones (m)
+SEAM_MARGIN: Final = 0.5  # distance before the seam within which a cone belongs to the beginning (m)
 SIGMAS_CALIBRATIONS: Final = (0.05, 0.02, 0.03, 0.1, 0.05, 0.05, 0.2)
-"""Standard deviations of the calibrations where a known map is met: speeds and rates, then the sensor's yaw
-(rad), offset (m), latency (s), and scale and bias (m) of ranges. A map tells them all, its size as well."""
-FIRST_ROOM: Final = 2.0  # by which the first place beside a pose may be farther off than another (m)
-FIRST_REACH: Final = 20.0  # about it, in which the poses of the window are located (m along the curve)
-SIGMA_STEP: Final = 10.0  # free motion of a control point in a step while the loop is optimized (m)
+"""Prior standard deviations of the calibrations on a known map, where all are observable: odometry's scale
+(-) and yaw-rate bias (rad/s), and the sensor's yaw (rad), offset (m), latency (s), range scale (-) and bias
+(m)."""
+FIRST_ROOM: Final = 2.0  # largest distance of the first place beside a pose over that of the nearest (m)
+FIRST_REACH: Final = 20.0  # search range of foot points about that place (m along the curve)
+SIGMA_STEP: Final = 10.0  # damping of control points while the loop is optimized (m)
 
 
 def apply_correspondences(smoother: CurveSmoother, registration: RefinedMotion) -> None:
-    """Move the window onto the beginning, and associate the inliers with it."""
+    """Move the window to the beginning of the curves, and associate the inliers with it."""
     smoother.reactivate(with_prior=smoother.submaps is None)
     state = smoother.map.state
     registration.motion.move(state.poses)
@@ -53,7 +56,7 @@ def apply_correspondences(smoother: CurveSmoother, registration: RefinedMotion) 
         smoother.map.detections.take(rows, label, u)
 
 
-# --- the change of an open curve, whose end overlaps its beginning, to a periodic one ---------------------
+# --- from an open curve, whose end overlaps its beginning, to a periodic one ------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +65,10 @@ class Overlap:
 
     period: float  # length of the closed curve in the open curve's parameter (m)
     u: Array  # (k,) increasing parameters of the open curve's end, from the seam on
-    w: Array  # (k,) parameters of the same places on the beginning, from 0 on
+    w: Array  # (k,) parameters of the corresponding points on the beginning, from 0 on
 
     def new_parameter(self, u: Array) -> Array:
-        """Map parameters of the open curve to those of the closed one, which are not wrapped."""
+        """Map parameters of the open curve to those of the closed one, without wrapping."""
         return np.where(u < self.u[0], u, self.period + np.interp(u, self.u, self.w))
 
 
@@ -87,10 +90,9 @@ def make_periodic(
     *,
     is_line: bool = False,
 ) -> PeriodicCurve:
-    """Return the periodic curve that is nearest to an open one with control points (n, 2).
+    """Fit a periodic curve to an open one with control points (n, 2).
 
-    Its number of control points is a share of that of its cones, which lie at their parameters on the curve,
-    or of the places that stand for those of a line.
+    The number of its control points is a share of the number of cones, or of equivalent places on a line.
     """
     spline, overlap = boundary.spline(control_points), find_overlap(boundary, control_points)
     period, u = overlap.period, boundary.cone_parameters
@@ -109,7 +111,7 @@ def make_periodic(
 
 
 def _apart(values: Array, distance: float) -> Array:
-    """Return those of the sorted values (k,) that exceed the last returned one by more than `distance`."""
+    """Thin sorted values (k,) so that successive ones differ by more than `distance`."""
     kept: list[float] = []
     for value in values.tolist():
         if not kept or value - kept[-1] > distance:
@@ -118,9 +120,9 @@ def _apart(values: Array, distance: float) -> Array:
 
 
 def find_overlap(boundary: Boundary, control_points: Array) -> Overlap:
-    """Find the overlap of a curve's end and beginning; the seam is the beginning's foot point on the end.
+    """Find the overlap of a curve's end with its beginning; the seam is the foot point of the beginning.
 
-    If the end does not reach the beginning, the gap between them counts as straight.
+    A gap between end and beginning is bridged by a straight line.
     """
     confirmed_end = boundary.confirmed_end
     late = max(confirmed_end - BEGINNING - JOIN_MARGIN, JOIN_SHARE * confirmed_end)
@@ -152,7 +154,7 @@ def simplify(smoother: CurveSmoother) -> None:
 
 
 def substitute(smoother: CurveSmoother, periodic: dict[int, PeriodicCurve]) -> None:
-    """Change the variables, `C_old = E C_new`, in the graph, the detections and the poses' parameters."""
+    """Change variables by `C_old = E C_new` in graph, detections and parameters of the poses."""
     state, detections = smoother.map.state, smoother.map.detections
     closed = {label: state.boundaries[label].closed(new.knots) for label, new in periodic.items()}
     replace_points(
@@ -173,12 +175,12 @@ def substitute(smoother: CurveSmoother, periodic: dict[int, PeriodicCurve]) -> N
 # --- the marginal of the open lap's batch ----------------------------------------------------------------
 
 
-def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
-    """Replace curves and prior by the marginal of a lap, and return the jump (3,) of the newest pose.
+def swap_in(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
+    """Replace curves and prior by the marginal of a lap; return the jump (3,) of the newest pose.
 
-    The window keeps its own factors of the poses from `first_kept` on, the marginal has those of all poses
-    before, so nothing is counted twice. The marginal holds the curves' spacing and shape as well. Poses after
-    the last one of the lap are moved with it.
+    The window keeps its own factors of the poses from `first_kept` on, and the marginal has those of all
+    earlier poses, so nothing is counted twice. The marginal includes the priors of spacing and shape. Poses
+    after the last one of the lap move rigidly with it.
     """
     state, settings, first = smoother.map.state, smoother.map.settings, marginal.first_kept
     smoother.reactivate(with_prior=False)
@@ -201,7 +203,7 @@ def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
 
 
 def _move_poses(poses: Array, solved: Array) -> None:
-    """Set the first poses of the window (P, 3) to the solved ones (k, 3), and move the others rigidly."""
+    """Set the first poses of the window (P, 3) to the solved ones (k, 3), and move the rest rigidly."""
     last = poses[len(solved) - 1].copy()
     for pose in poses[len(solved) :]:
         pose[:] = compose(solved[-1], relative(last, pose))
@@ -212,9 +214,9 @@ def _move_poses(poses: Array, solved: Array) -> None:
 
 
 def lay_on_known(road: Road, known: KnownMap, motion: Motion, covariance: Array) -> Array:
-    """Replace an open road's curves and prior by a known map's; return the jump (3,) of the newest pose.
+    """Replace curves and prior of an open road by a known map; return the jump (3,) of the newest pose.
 
-    The motion lays the road on the map, and its covariance (3, 3) is that of the newest pose there.
+    The motion registers the road to the map; the covariance (3, 3) is of the newest pose, map frame.
     """
     smoother, state = road.smoother, road.smoother.map.state
     variables = state.variables
@@ -245,7 +247,7 @@ def lay_on_known(road: Road, known: KnownMap, motion: Motion, covariance: Array)
 
 
 def _locate_first(state: State) -> None:
-    """Set `pose_u` on open curves to the first places beside the poses: curves may lead there again."""
+    """Set `pose_u` on open curves to the first place beside the poses, as a curve may pass there twice."""
     newest = state.poses[-1]
     for label, boundary in state.boundaries.items():
         points = state.control_points(label)
@@ -260,13 +262,13 @@ def _locate_first(state: State) -> None:
 
 
 def _next(boundaries: dict[int, Boundary], known: KnownMap, label: int, settings: MapperSettings) -> Boundary:
-    """Return a known curve whose control points have other keys than those of the curve before."""
+    """Return a known curve whose control points have new keys."""
     before = boundaries.get(label)
     return known.boundary(label, settings, before.first + before.size if before else 0)
 
 
 def as_pose(motion: Motion) -> Array:
-    """Return a motion as the pose (3,) to which the origin is moved."""
+    """Return a motion as the pose (3,) of the moved origin."""
     turn = motion.vector[2]
     return np.append(motion.centre + motion.vector[:2] - rotation(turn) @ motion.centre, turn)
 
@@ -274,13 +276,12 @@ def as_pose(motion: Motion) -> Array:
 # --- the gauge -------------------------------------------------------------------------------------------
 
 
-def hold_gauge(smoother: CurveSmoother) -> None:
-    """Hold where the closed map as a whole is, across its curves, while its shape goes on to be estimated.
+def fix_gauge(smoother: CurveSmoother) -> None:
+    """Fix the rigid motion of a closed map; its shape is still estimated.
 
-    Only the beginning of the drive is known in the map frame: later laps tell of the gauge through the shape
-    of the curves beside the start alone. They average out the noise of detections, but cones lie off a curve
-    with few control points by the same distance in each lap. Many laps bend the curve to it, and a bend of
-    centimetres beside the start turns the whole map. So its uncertainty is frozen after a few laps.
+    Only the beginning of the drive is known in the map frame. Over many laps the fitted curve becomes
+    overconfident about centimetre offsets from the cones, which few control points cannot follow. Such an
+    offset near the start rotates the whole map. So the uncertainty of the rigid motion is frozen.
     """
     state = smoother.map.state
     tangents = [state.spline(label).tangent_unit(b.abscissae) for label, b in state.boundaries.items()]
@@ -290,10 +291,10 @@ def hold_gauge(smoother: CurveSmoother) -> None:
 
 
 def motion_across(points: Array, normals: Array) -> Array:
-    """Return the rows C (3, 2k) by which `C dx` is the rigid motion that fits small moves dx (2k,) best.
+    """Return the rows C (3, 2k) such that `C dx` is the best-fitting rigid motion for small moves dx (2k,).
 
-    Points (k, 2) of a curve may slide along it, so their moves count along the normals (k, 2) only. With the
-    rows N (k, 2k) of the normals and the rigid motions G it is the least squares solution `(N G)^+ N`.
+    Points (k, 2) may slide along their curve, so only moves along the normals (k, 2) count. With the rows N
+    (k, 2k) of the normals and the rigid motions G (2k, 3), this is the least-squares solution `(N G)^+ N`.
     """
     count = len(points)
     across = np.zeros((count, count, 2))

@@ -1,15 +1,15 @@
-"""The drive: what its phases have in common, and what a phase makes of a cycle."""
+"""The drive, which all phases share, and the interface of a phase."""
 
 from dataclasses import dataclass
 from functools import partial
 from math import nan
-from typing import Final, Protocol, Self
+from typing import ClassVar, Final
 
 import numpy as np
 
 from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.relative import Revisit
@@ -19,51 +19,39 @@ from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .closing import go_on_from, lay_on_known
+from .closing import lay_on_known, swap_in
 from .drive_record import DriveRecord
+from .known_loop import evidence_of
 from .lap_solver import LapSolver, Outcome
 from .revisit import lay_on
 
-REST: Final = 10.0  # distance for which only the road is mapped after a failure (m)
-KNOWN: Final = "the map was known before the drive"  # why a drive on a known map has no batch
-LEARNED: Final = "the drive contradicts the calibration, which is learned"
-"""Notice of the cycle in which the priors of the calibrations are first doubted."""
+REST: Final = 10.0  # distance after a failure on which phases do nothing (m)
+KNOWN: Final = "the map was known before the drive"  # reason why a drive on a known map has no batch
+LEARNED: Final = "the drive contradicts the prior of the calibration, which is estimated with a wider one"
+"""Notice of the first cycle with wider priors of the calibrations."""
 
 
-class Drive:
-    """The record of a drive, the batches of it, the health of its estimate, and its priors."""
+class Drive(Copyable):
+    """What the phases share: record, batches, health monitor and priors of the calibrations."""
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
-        self.priors = settings
-        """The settings with the priors of the calibrations as they are now."""
+        self.priors = settings  # settings with the present priors of the calibrations
         self.record = DriveRecord(settings)
         self.solver = LapSolver(settings)
         self.monitor = HealthMonitor()
         self.revisits: tuple[Revisit, ...] = ()
-        """Poses measured in the frame of earlier ones, by which the open map was optimized."""
-        self.closed_by: Revisit | None = None
-        """Return that began the batch which has closed the loop."""
-        self.lap_seconds = nan
-        """Wall time (s) of the newest batch that the map is of."""
-        self.placed_at: float | None = None
-        """Stamp (s) of the cycle in which the vehicle was found on a known map."""
-        self.keeps_map = False
-        """Whether that map is held as it is."""
+        """Relative poses by which the open map was optimized where road was met again."""
+        self.closed_by: Revisit | None = None  # relative pose that started the batch of the loop closure
+        self.lap_seconds = nan  # wall time of the batch of the present map (s)
+        self.placed_at: float | None = None  # stamp of the localization on a known map (s)
+        self.keeps_map = False  # whether the known map is fixed
         self._rests_until = 0.0  # path (m)
-
-    def copy(self) -> Self:
-        """Return a drive that can go on independently; a batch that is under way is of both."""
-        other = shallow(self)
-        other.record = self.record.copy()
-        other.solver = self.solver.copy()
-        other.monitor = self.monitor.copy()
-        return other
 
     # --- priors and health -------------------------------------------------------------------------------
 
     def inflate_priors(self, road: Road, reading: Reading) -> str:
-        """Widen the priors of calibrations that an open drive contradicts; return a notice once."""
+        """Widen the priors of calibrations that an open drive contradicts; return a notice the first time."""
         before = self.priors
         doubted, measured = reading.sensor_doubted, reading.measured
         self.priors = inflate_priors(road.smoother, before, doubted, measured)
@@ -73,13 +61,13 @@ class Drive:
 
     @property
     def can_repair(self) -> bool:
-        """Return whether a closed map can be repaired: by a batch of the drive, or a known map in place."""
+        """Whether a closed map can be repaired: by a batch of the drive, or a known map in place."""
         return self.record.unsolvable is None or (self.placed_at is not None and not self.keeps_map)
 
     # --- rest after a failure ----------------------------------------------------------------------------
 
     def rest(self, road: Road) -> None:
-        """Give up the batch that is under way, and rest for `REST` metres."""
+        """Cancel the running batch, and rest for `REST` metres."""
         self._rests_until = road.path.length + REST
         self.solver.give_up(road.next_cycle)
 
@@ -87,37 +75,37 @@ class Drive:
         return road.path.length < self._rests_until
 
     def resume(self) -> None:
-        """Go on with the batch that was under way when a snapshot was taken."""
+        """Resume the batch that was running when the snapshot was saved."""
         self.solver.resume(prepares=self.record.unsolvable is None)
 
     # --- batches -----------------------------------------------------------------------------------------
 
     def begin_batch(self, road: Road, reading: Reading, start: ClosedMap | Revisit) -> None:
-        """Send the drive to its batch, which begins at a map, or at odometry and a revisit."""
+        """Start a batch of the drive from a closed map, or from odometry and a relative pose."""
         window = road.smoother.first_cycle, road.next_cycle - 1
         lap = partial(self.record.lap, start=start, settings=self.priors, noise=reading.noise)
         self.solver.begin(lap, window, reading.detections.t)
 
     def outcome(self, road: Road, spent: float) -> Outcome | None:
-        """Return the result of the batch where it is due in this cycle, which has taken `spent` (s)."""
+        """Return the result of the batch if it is due in this cycle, which has taken `spent` (s)."""
         smoother = road.smoother
         return self.solver.outcome(road.next_cycle - 1, smoother.times, smoother.first_cycle, spent)
 
     def close(self, road: Road, solved: LapMarginal, returned_by: Revisit | None) -> Array:
-        """Close the loop of an open road by the batch that a return has begun; return the jump (3,)."""
+        """Close the loop of an open road by the batch of a return; return the jump (3,)."""
         self.closed_by = returned_by
-        return self.go_on_from(road, solved)
+        return self.swap_in(road, solved)
 
-    def go_on_from(self, road: Road, solved: LapMarginal) -> Array:
-        """Replace map and prior of a road by a batch's; return the jump (3,) of the newest pose."""
-        jump = go_on_from(road.smoother, solved)
+    def swap_in(self, road: Road, solved: LapMarginal) -> Array:
+        """Replace map and prior of a road by those of a batch; return the jump (3,) of the newest pose."""
+        jump = swap_in(road.smoother, solved)
         self.lap_seconds = solved.seconds
         self.record.replaced(np.concatenate([solved.poses[: solved.first_kept], road.poses]))
         road.place_orange(self.record.corrected)
         return jump
 
     def lay_on_known(self, road: Road, known: KnownMap, motion: Motion, covariance: Array) -> Array:
-        """Lay an open road on a known map; return the jump (3,) of the newest pose."""
+        """Replace an open road by the known map that it is registered to; return the jump (3,)."""
         earlier = self.record.with_window(road)[: road.smoother.first_cycle]
         motion.move(earlier)
         self.solver.give_up(road.next_cycle)
@@ -130,7 +118,7 @@ class Drive:
         return jump
 
     def lay_on(self, road: Road, revisit: Revisit) -> Array:
-        """Lay an open road on its earlier pass; return the jump (3,) of the newest pose."""
+        """Optimize an open road with a revisit; return the jump (3,) of the newest pose."""
         jump = lay_on(road, self.record, revisit)
         self.revisits = (*self.revisits, revisit)
         road.place_orange(self.record.corrected)
@@ -139,33 +127,30 @@ class Drive:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What a phase has made of a cycle."""
+    """Result of a phase in a cycle."""
 
-    phase: "Phase"  # of the next cycle
-    jump: Array | None = None  # (3,) of the newest pose, where the map or its place was replaced
+    phase: "Phase"  # phase of the next cycle
+    jump: Array | None = None  # (3,) jump of the newest pose, if map or pose was replaced
     notice: str = ""
-    health: Health | None = None  # where it has changed
+    health: Health | None = None  # health, if the phase has changed it
 
 
-class Phase(Protocol):
-    """What a cycle does beside mapping: on an open road, on a closed map, and where the vehicle is lost."""
+class Phase(Copyable):
+    """What a cycle does besides mapping; this one never replaces the map."""
 
-    uses_detections: bool
-    """Whether detections may change the road."""
-
-    def copy(self) -> Self:
-        """Return a phase that can go on independently."""
+    uses_detections: ClassVar[bool] = True  # whether detections may change the road
 
     def judge(
         self, road: Road, drive: Drive, classified: Classified, reading: Reading
     ) -> tuple["Phase", Health]:
         """Judge the estimate before its update; return the phase of this cycle, and the health."""
+        return self, drive.monitor.update(evidence_of(road.smoother, classified.tested, None, reading))
 
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        """Do what the phase does after the update of a cycle, which has taken `spent` (s) so far.
-
-        A drive that rests is left alone.
-        """
+        """Act after the update of a cycle, which has taken `spent` (s); do nothing while the drive rests."""
+        drive.record.estimated(road)
+        return Step(self)
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
-        """Go on from the result of a batch."""
+        """Continue from the result of a batch."""
+        return Step(self)

@@ -1,15 +1,15 @@
-"""The drive as it was measured, and its poses along the curves: what a batch of the lap is made of."""
+"""Record of the measurements and poses of a drive, from which a batch of the lap is built."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain as chain_of
-from typing import Final, Generic, Self, TypeVar
+from typing import Final, Generic, TypeVar
 
 import numpy as np
 
 from pathspace_graph.batch.lap import ClosedMap, OpenLap
 from pathspace_graph.batch.start import unwrap
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.front_end.front_end import Reading
@@ -30,10 +30,10 @@ C = TypeVar("C", bound=DetectionColumns)
 
 
 def bend(poses: Array, known: Mapping[int, Array]) -> Array:
-    """Return the poses (n, 3) of a path bent so that some of them have known values (3,), by index.
+    """Bend a path of poses (n, 3) so that some of them have known values (3,), by index.
 
-    A pose between two of these is the mean of its places as seen from each, weighted by the nearness along
-    the path. A pose after the last one moves with it.
+    A pose between two known ones moves rigidly with each, and their results are interpolated by path length.
+    A pose after the last known one moves rigidly with it.
     """
     at, along = np.array(sorted(known)), path_lengths(poses)
     before = at.searchsorted(np.arange(len(poses)), side="right") - 1
@@ -50,19 +50,14 @@ def bend(poses: Array, known: Mapping[int, Array]) -> Array:
     return np.asarray(moved[0] + weight * change)
 
 
-class CycleList(Generic[T]):
-    """A list that only grows, with one item for each cycle; its copies share all but the newest items."""
+class CycleList(Copyable, Generic[T]):
+    """List that only grows, with one item per cycle; copies share all but the newest items."""
 
     BLOCK: Final = 200  # items of a shared block
 
     def __init__(self) -> None:
         self._blocks: tuple[list[T], ...] = ()
         self._newest: list[T] = []
-
-    def copy(self) -> Self:
-        other = shallow(self)
-        other._newest = self._newest.copy()
-        return other
 
     def __len__(self) -> int:
         return self.BLOCK * len(self._blocks) + len(self._newest)
@@ -82,39 +77,32 @@ class CycleList(Generic[T]):
 
 @dataclass(frozen=True, eq=False)
 class MeasuredCycle:
-    """What was measured up to a cycle and in it."""
+    """Measurements of a cycle."""
 
-    motion: MeasuredMotion  # that leads to the cycle
-    seen: Detections  # as they came
-    orange: Detections  # those of orange cones
+    motion: MeasuredMotion  # motion from the previous cycle
+    seen: Detections  # detections of boundary cones, with stated covariances
+    orange: Detections  # detections of orange cones
 
 
-class DriveRecord:
-    """The odometry, the detections and the poses of every cycle, kept as long as a batch can solve them."""
+class DriveRecord(Copyable):
+    """Odometry, detections and poses of every cycle, as long as a batch can solve them."""
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
-        self.unsolvable: str | None = None  # why the drive cannot be solved as a batch; None if it can be
-        self.poses: Array = np.zeros((0, 3))  # of each cycle, map frame, as of then or the newest batch
-        self.corrected: Array = self.poses  # (k, 3) of the first k cycles, as they were replaced last
+        self.unsolvable: str | None = None  # reason why no batch can solve the drive, if there is one
+        self.poses: Array = np.zeros((0, 3))  # (P, 3) online poses, or those of the newest batch; map frame
+        self.corrected: Array = self.poses  # (k, 3) poses of the first k cycles after the last correction
         self.stamps: CycleList[float] = CycleList()  # stamp of each cycle (s)
         self._measured: CycleList[MeasuredCycle] = CycleList()
-        self._factors: tuple[Rows, ...] = ()  # of the user's factors on poses, at values of zero
-
-    def copy(self) -> Self:
-        """Return a record that can go on independently."""
-        other = shallow(self)
-        other.stamps = self.stamps.copy()
-        other._measured = self._measured.copy()
-        return other
+        self._factors: tuple[Rows, ...] = ()  # user factors on poses, at values of zero
 
     def give_up(self, reason: str) -> None:
-        """Drop the measurements; the first reason counts."""
+        """Drop the measurements, as no batch can solve them; the first reason is kept."""
         self.unsolvable = self.unsolvable or reason
         self._measured, self._factors = CycleList(), ()
 
     def measured(self, reading: Reading) -> None:
-        """Add the motion that leads to a pose, and the detections there as they came."""
+        """Add the motion and the detections of a cycle."""
         self.stamps.append(reading.detections.t)
         if self.unsolvable is not None:
             return
@@ -123,9 +111,9 @@ class DriveRecord:
             self.give_up("the lap is too long for a batch")
 
     def given(self, rows: Sequence[Rows] | None) -> None:
-        """Add the user's factors on poses, as rows at values of zero; None where a batch can't have them."""
+        """Add user factors on poses, as rows at values of zero; None for factors that no batch can have."""
         if rows is None and self.unsolvable is None:
-            self.give_up("the user's factors hold control points, which are others in a batch")
+            self.give_up("the user's factors hold control points, and a batch has other ones")
         elif rows and self.unsolvable is None:
             self._factors = (*self._factors, *rows)
 
@@ -135,7 +123,7 @@ class DriveRecord:
             self.poses = read_only(np.concatenate([self.poses, road.poses[-1:]]))
 
     def with_window(self, road: Road) -> Array:
-        """Return the poses (P, 3) of all cycles: those of the window are as they are now."""
+        """Return the poses (P, 3) of all cycles, with the present ones of the window."""
         return unwrap(np.concatenate([self.poses[: road.smoother.first_cycle], road.poses]))
 
     def replaced(self, poses: Array) -> None:
@@ -143,14 +131,17 @@ class DriveRecord:
         self.poses = self.corrected = read_only(unwrap(poses))
 
     def bent(self, keyframes: Mapping[int, Array], road: Road) -> None:
-        """Replace the poses: the window has its own, earlier ones move with the keyframes (3,), by cycle."""
+        """Replace the poses: those before the window move with the keyframes (3,), given by cycle."""
         first = road.smoother.first_cycle
         earlier, window = unwrap(self.poses[: first + 1]), road.poses
         bent = bend(earlier, {0: earlier[0], **keyframes, first: window[0]})
         self.replaced(np.concatenate([bent[:first], window]))
 
     def seen_in(self, sensor: Array, noise: NoiseLearner) -> SeenIn:
-        """Return the cones detected in some cycles, corrected by the sensor's calibration: (5,) or (0,)."""
+        """Return a lookup of the cones detected in given cycles.
+
+        Points are corrected by the calibration of the sensor, (5,) or (0,).
+        """
 
         def seen_in(cycles: IntArray) -> DetectionColumns:
             chosen = [self._measured[k] for k in cycles.tolist()]
@@ -165,7 +156,7 @@ class DriveRecord:
     def lap(
         self, first_kept: int, start: ClosedMap | Revisit, settings: MapperSettings, noise: NoiseLearner
     ) -> OpenLap:
-        """Return the lap; the priors of its calibrations are those of the settings, which may be wide."""
+        """Return the lap for a batch, with the priors of the calibrations in `settings`."""
         cycles = [*self._measured]
         motions = noise.motions_of_lap([one.motion for one in cycles])
         chain = chained([*self.stamps], motions, settings.odometry)
@@ -174,6 +165,6 @@ class DriveRecord:
 
 
 def _for_map(table: C, noise: NoiseLearner) -> C:
-    """Return a table as it counts in a map, with the noise that is known now."""
+    """Return a table with the corrections and covariances of the noise known now."""
     known = noise.for_map(Detections(0.0, table.measured, table.covariance, table.label))
     return replace(table, measured=known.points_vehicle, covariance=known.covariances)

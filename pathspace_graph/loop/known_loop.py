@@ -1,4 +1,4 @@
-"""The closed map as detections are compared with it, and what they say about the estimate."""
+"""The closed map prepared for comparison with detections, and the evidence of detections on the estimate."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial import KDTree
 
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.front_end.front_end import Reading
@@ -19,32 +20,31 @@ from pathspace_graph.mapping.registration import worst_sigma
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
 from pathspace_graph.mapping.state import SAMPLE
 
-MIDDLE_STEP: Final = 2.0  # distance of the places along the loop (m)
+MIDDLE_STEP: Final = 2.0  # step of the points of the middle (m)
 BESIDE_CURVE: Final = 1.0  # distance from the closed curve within which an unused detection is explained (m)
-GAP_RATIO: Final = 3.0  # least distance of neighbouring cones with a gap between them, over the median
-_POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])  # unit vectors that choose a pose's position
+GAP_RATIO: Final = 3.0  # least distance of neighbouring cones beside a gap, over the median distance
+_POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])  # unit vectors of a pose's position
 
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A closed map as the search needs it."""
+    """A closed map, sampled for search and comparison."""
 
     middle: Array  # (n, 2) points on the middle of the track in driving order, in m, map frame
-    stations: Array  # (n,) length along the middle up to each of them (m)
+    stations: Array  # (n,) stations of these points (m)
     length: float  # length of the middle (m)
-    beside: Mapping[int, Array]  # (n,) parameters beside the points of the middle on each boundary (m)
+    beside: Mapping[int, Array]  # (n,) parameters on each boundary beside the points of the middle (m)
     curves: Mapping[int, KDTree]  # densely sampled points of each boundary
-    mapped: Mapping[int, BoolArray]  # whether each of these lies between detected cones (`is_mapped`)
-
-    begins: Mapping[int, float]  # parameter of the first of them (m)
+    mapped: Mapping[int, BoolArray]  # whether each of these points is between mapped cones (`is_mapped`)
+    begins: Mapping[int, float]  # parameter of the first point (m)
 
     def at(self, stations: Array) -> Array:
-        """Return the points of the middle at stations of any shape, as complex numbers x + i y."""
+        """Interpolate the middle at stations of any shape, as complex numbers x + i y."""
         x, y = (np.interp(stations, self.stations, axis, period=self.length) for axis in self.middle.T)
         return np.asarray(x + 1j * y)
 
     def distances(self, labels: IntArray, points: Array, most: float) -> Array:
-        """Return the distance (..., m) of points (..., m, 2) from their curve (m,), in m, at most `most`."""
+        """Return distances (..., m) in m of points (..., m, 2) from their labels' curves, up to `most`."""
         found = np.full(points.shape[:-1], most)
         for label, curve in self.curves.items():
             of_label = labels == label
@@ -57,12 +57,12 @@ class Loop:
         return [label for label, mapped in self.mapped.items() if not mapped.all()]
 
     def is_mapped(self, label: int, u: Array) -> BoolArray:
-        """Return which parameters (m,) of a boundary lie between detected cones, to the nearest sample."""
+        """Whether parameters (m,) of a boundary are between mapped cones, to the nearest sample."""
         nearest = np.rint((u - self.begins[label]) / SAMPLE).astype(np.intp)
         return self.mapped[label].take(nearest, mode="wrap")
 
     def beside_gaps(self, labels: IntArray, points: Array) -> BoolArray:
-        """Return which points (m, 2) are nearest to a gap of their curve (m,), where no cone is mapped."""
+        """Whether points (m, 2) are nearest to a gap of the curve of their label (m,)."""
         found = np.zeros(len(points), bool)
         for label, curve in self.curves.items():
             of_label = np.flatnonzero(labels == label)
@@ -71,9 +71,9 @@ class Loop:
         return found
 
     def compared(self, labels: IntArray, points: Array) -> tuple[BoolArray, BoolArray, BoolArray]:
-        """Return which points (m, 2) with labels (m,) lie on their curve, and which beside a gap of it.
+        """Whether points (m, 2) with labels (m,) lie on their curve, beside a gap of it, and are evidence.
 
-        The third result is false for those that say nothing: they lie on the curve of the other colour alone.
+        A point only on the curve of the other colour is no evidence.
         """
         on_curve = self.distances(labels, points, BESIDE_CURVE) < BESIDE_CURVE
         beside_gap = ~on_curve & self.beside_gaps(labels, points)
@@ -82,10 +82,10 @@ class Loop:
 
 
 def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) -> BoolArray:
-    """Return which parameters (m,) of a closed curve lie between neighbouring cones at parameters (k,), in m.
+    """Whether parameters (m,) of a closed curve are between neighbouring cones at parameters (k,), in m.
 
-    The others lie in a gap, longer than `gap` times the median distance of neighbours, and farther than the
-    margin (m) from its ends. Where the cones are not known, all of the curve counts as mapped.
+    A gap is longer than `gap` times the median distance of neighbours; the `margin` (m) at its ends counts as
+    mapped. Without known cones, all of the curve does.
     """
     if len(cones) < 2:
         return np.ones(len(u), bool)
@@ -98,7 +98,7 @@ def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) 
 
 
 def lay_out_loop(track: CurveMap) -> Loop:
-    """Return the loop between two closed curves."""
+    """Sample the loop between two closed curves."""
     u, points, mapped, begins, margin = {}, {}, {}, {}, track.settings.growth.merge_radius
     for label, boundary in track.state.boundaries.items():
         u[label] = np.arange(boundary.tables.low, boundary.tables.high, SAMPLE)
@@ -117,14 +117,14 @@ def lay_out_loop(track: CurveMap) -> Loop:
     return Loop(middle, stations, float(steps.sum()), beside, curves, mapped, begins)
 
 
-class KnownLoop:
-    """The closed map, laid out when it is asked for, and again once its curves were replaced by others."""
+class KnownLoop(Copyable):
+    """Cache of the sampled loop, renewed when the curves are replaced."""
 
     def __init__(self) -> None:
         self._laid_out: tuple[list[SpanPolynomials], Loop] | None = None
 
     def of(self, smoother: CurveSmoother) -> Loop:
-        """Return the loop as it was when it was laid out, which changes no variable."""
+        """Return the loop, sampled at the first call for its curves; no variable changes."""
         state = smoother.map.state
         tables = [boundary.tables for boundary in state.boundaries.values()]
         if self._laid_out is None or self._laid_out[0] != tables:
@@ -138,12 +138,12 @@ class KnownLoop:
 def evidence_of(
     smoother: CurveSmoother, tested: Gating | None, known: KnownLoop | None, reading: Reading
 ) -> Evidence:
-    """Return what the tested detections say about the newest pose, before the update.
+    """Return the evidence of the tested detections on the newest pose, before the update.
 
-    On a closed map every coloured detection should lie on a curve. If many are not in use, these are looked
-    for on the whole of their curve, where the loop is `known`: they may be of a stretch across the infield.
-    Three kinds say nothing about the vehicle: those not seen again of all detections of the cycle, those on
-    the curve of the other colour, and those beside a gap of the map.
+    On a closed map every coloured detection should lie on a curve. If many are not in use, and the loop is
+    `known`, they are searched on their whole curve: they may show a stretch across the infield. Three kinds
+    of unused detections are no evidence: those not seen again, those on the curve of the other colour, and
+    those beside a gap of the map.
     """
     motion, seen_again = reading.motion, reading.seen_again
     if tested is None:
@@ -176,11 +176,11 @@ def evidence_of(
 
 
 def _sigma_of_position(smoother: CurveSmoother) -> float:
-    """Return the standard deviation (m) of the newest position in its worst direction, by the last step."""
+    """Return the standard deviation (m) of the newest position in its worst direction, at the last step."""
     last = smoother.last_step
     if last is None:
         return np.nan
-    half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())  # the newest pose is the last block
+    half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())  # the newest pose is last
     return worst_sigma(half.T @ half)
 
 

@@ -1,50 +1,46 @@
-"""The batches of a drive: one lap at a time is solved in another process, and taken when it is due."""
+"""Schedule of the batches of a drive: one lap at a time, in another process, with a due cycle."""
 
 from collections.abc import Callable, Sequence
 from math import ceil
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
 from pathspace_graph.batch.lap import LapMarginal, OpenLap
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.settings.mapper import MapperSettings
 
 from . import worker
 from .worker import BATCH_LATE, LapBatch, Unsolved
 
-LONGEST_WAIT: Final = 1.0  # of a cycle for a batch (s), however long ago the cycle before it was
+LONGEST_WAIT: Final = 1.0  # longest wait of a cycle for a batch (s)
 
 Outcome = LapMarginal | Unsolved
 
 
-class LapSolver:
-    """The batch that is under way, if there is one, and the cycles in which batches have ended."""
+class LapSolver(Copyable):
+    """The running batch, if there is one, and the cycles in which batches have ended."""
 
     def __init__(self, settings: MapperSettings) -> None:
-        self.late_cycles = 0  # cycles by which the slowest batch is late in a vehicle, by its wall time
+        self.late_cycles = 0  # cycles by which the slowest batch would be late in a vehicle, by wall time
         self._settings = settings.open_lap
         self._max_poses = settings.max_poses
         self._batch: LapBatch | None = None
         self._ends: tuple[int, ...] = ()
         self._prepared = False
 
-    def copy(self) -> Self:
-        """Return a solver that can go on independently; a batch that is under way is of both."""
-        return shallow(self)
-
     @property
     def is_busy(self) -> bool:
-        """Return whether a batch is under way."""
+        """Whether a batch is running."""
         return self._batch is not None
 
     @property
     def first_kept(self) -> int | None:
-        """Return the cycle whose pose must stay in the window until the lap is solved, if there is one."""
+        """Return the first cycle whose pose must stay in the window for a running batch."""
         return self._batch.first_kept if self._batch else None
 
     def ends(self, next_cycle: int) -> tuple[int, ...]:
-        """Return the cycles in which results of batches were taken, or they were or will be given up."""
+        """Return the cycles in which batches ended, with the latest possible one of a batch that is due."""
         batch, ends = self._batch, self._ends
         if batch is None or next_cycle <= batch.due <= batch.last:
             return ends
@@ -53,22 +49,22 @@ class LapSolver:
     # --- the process -------------------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Start the process, once, so that it is ready when a lap is over."""
+        """Start the process once, so that it is ready when a lap is complete."""
         if not self._prepared:
             self._prepared = True
             worker.submit(worker.nothing)
 
     def resume(self, prepares: bool) -> None:
-        """Send the lap that was being solved when a snapshot was taken, or start the process again."""
+        """Resend the lap of a snapshot's running batch, or restart the process."""
         if self._batch is not None:
             self._batch.send()
         elif self._prepared and prepares:
             worker.submit(worker.nothing)
 
     def begin(self, lap: Callable[[int], OpenLap], window: tuple[int, int], t: float) -> None:
-        """Send a lap, given the first cycle whose pose is kept, at t (s) in the newest cycle of the window.
+        """Send a lap, built for its first kept cycle, at t (s) in the newest cycle of the window.
 
-        The result is due some cycles later, and in a replay in the recorded cycle.
+        The result is due some cycles later; in a replay, in the recorded cycle.
         """
         settings, (first, cycle) = self._settings, window
         wait = max(min(settings.cycles, cycle - first), int(settings.cycles_share * cycle))
@@ -79,7 +75,7 @@ class LapSolver:
         self._batch = LapBatch(lap(first_kept), t, due, last)
 
     def give_up(self, next_cycle: int) -> None:
-        """Take a batch that is under way from the process."""
+        """Cancel the running batch."""
         if self._batch is not None:
             self._batch.give_up()
             self._batch = None
@@ -88,16 +84,16 @@ class LapSolver:
     # --- results -----------------------------------------------------------------------------------------
 
     def wait(self, next_cycle: int) -> None:
-        """Wait for the batch whose result the next cycle may take, however long that takes."""
+        """Wait without limit for the batch whose result may be due in the next cycle."""
         batch = self._batch
         if batch is not None and batch.due <= next_cycle <= batch.last:
             batch.wait()
 
     def outcome(self, cycle: int, times: Sequence[float], first_cycle: int, spent: float) -> Outcome | None:
-        """Return the result of a batch in a cycle from which on it is due; None leaves it to the next one.
+        """Return the result of the batch if it is due and ready; None otherwise.
 
-        The window has stamps `times` (s) from `first_cycle` on. The wait ends with the cycle's period, the
-        time since the one before it, of which `spent` (s) is over. A batch that is too late is given up.
+        The window has stamps `times` (s) from `first_cycle` on. The wait ends with the period of the cycle,
+        of which `spent` (s) is over. A batch past its last cycle is cancelled.
         """
         batch = self._batch
         if batch is None or cycle < batch.due:
@@ -118,9 +114,9 @@ class LapSolver:
         return outcome
 
     def last_outcome(self, cycle: int) -> Outcome | None:
-        """Return the result of a batch that is under way, as no cycle follows the given one.
+        """Wait for the result of the running batch after the last cycle of a drive.
 
-        In a replay, a batch that ended later is left under way.
+        In a replay, a batch that ended later keeps running.
         """
         if self._batch is None or self._settings.ends[len(self._ends) :]:
             return None

@@ -1,9 +1,8 @@
-"""The lost vehicle: its place on the closed map is searched, and the road beside it is mapped anew."""
+"""The lost vehicle: search its place on the closed map, and map the road beside it separately."""
 
 from dataclasses import replace
-from typing import Final, Self
+from typing import Final
 
-from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, Health, HealthMonitor
 from pathspace_graph.mapping.road import Classified, Road
@@ -11,45 +10,35 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .drive import Drive, Phase, Step
 from .known_loop import evidence_of
-from .lap_solver import Outcome
-from .relocalization import FOUND, Search, start_anew
+from .relocalization import FOUND, Search, restart_window
 
-ROAD: Final = 10.0  # length of both boundaries beside a lost vehicle that make a road (m)
+ROAD: Final = 10.0  # least length of both boundaries of new road (m)
 NEW_ROAD: Final = "the vehicle has left the closed map, and is on new road"
-"""Reason of the health there, and notice of the first cycle."""
+"""Reason of the health on new road, and notice of the first cycle."""
 
 
-class Lost:
-    """The search for a lost vehicle, while the closed map stays as it was."""
+class Lost(Phase):
+    """Search for a lost vehicle; detections do not change the closed map."""
 
     uses_detections = False
 
     def __init__(self, closed: Phase, road: Road, health: Health) -> None:
-        """Begin where a vehicle on a closed map has become lost, for the reason of its health."""
-        self.closed = closed  # phase to which a vehicle comes back that is found
+        """Start when the vehicle on a closed map becomes lost, with the health that says why."""
+        self.closed = closed  # phase of a vehicle that is found
         self.search = Search(road)
-        self.new_road: Road | None = None  # road beside the vehicle, in a frame of its own
-        self._monitor = HealthMonitor()  # of the new road
+        self.new_road: Road | None = None  # road mapped while lost, in its own frame
+        self._monitor = HealthMonitor()  # monitor of the new road
         self._lost = self._health = health
-
-    def copy(self) -> Self:
-        """Return a phase that can go on independently."""
-        other = shallow(self)
-        other.closed = self.closed.copy()
-        other.search = self.search.copy()
-        other.new_road = self.new_road and self.new_road.copy()
-        other._monitor = self._monitor.copy()
-        return other
 
     def judge(
         self, road: Road, drive: Drive, classified: Classified, reading: Reading
     ) -> tuple[Phase, Health]:
-        """Remember what is seen; the health is that of the last attempt."""
+        """Record the detections for the search; the health is that of the last attempt."""
         self.search.look(road, classified, reading)
         return self, self._health
 
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        """Map the road beside the vehicle, and start the window anew where the vehicle is found."""
+        """Map the road beside the vehicle, and restart the window where the search finds the vehicle."""
         drive.record.estimated(road)
         if drive.rests(road):
             self.new_road = None
@@ -57,20 +46,16 @@ class Lost:
         sees_road = self._map_new_road(road, drive, reading)
         found = self.search.find(road.smoother)
         if found is None:
-            return self._go_on(self.search.is_off_map and sees_road)
+            return self._continue(self.search.is_off_map and sees_road)
         first_cycle = max(self.search.first_cycle, road.smoother.first_cycle)
         drive.monitor.restart()
-        jump = start_anew(road.smoother, first_cycle, found)
+        jump = restart_window(road.smoother, first_cycle, found)
         return Step(self.closed, jump, FOUND, Health(DEGRADED, FOUND))
 
-    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
-        """Leave the map as it is."""
-        return Step(self)
-
     def _map_new_road(self, road: Road, drive: Drive, reading: Reading) -> bool:
-        """Map the road beside the vehicle as an open one, with the calibration as it is known.
+        """Map the road beside the vehicle as an open one, with the known calibration.
 
-        Return whether both boundaries are there, and the estimate is good.
+        Return whether it has both boundaries, and its estimate is good.
         """
         if self.new_road is None:
             self.new_road, self._monitor = type(road)(_as_known(road, drive)), HealthMonitor()
@@ -86,8 +71,8 @@ class Lost:
         ends = [boundary.confirmed_end for boundary in new.boundaries.values()]
         return new.has_both_boundaries and min(ends) > ROAD and health.condition == GOOD
 
-    def _go_on(self, is_new: bool) -> Step:
-        """Go on searching; on new road, where no place of the map agrees, the vehicle is not lost."""
+    def _continue(self, is_new: bool) -> Step:
+        """Continue the search; on new road, where no place of the map agrees, the health is degraded."""
         before = self._health
         self._health = Health(DEGRADED, NEW_ROAD) if is_new else self._lost
         notice = NEW_ROAD if is_new and before == self._lost else ""
@@ -95,7 +80,7 @@ class Lost:
 
 
 def _as_known(road: Road, drive: Drive) -> MapperSettings:
-    """Return the settings with the priors of the calibrations about their present estimate."""
+    """Return the settings with the present estimate as mean of the calibrations' priors."""
     variables, priors = road.smoother.variables, drive.priors
     return replace(
         road.settings,

@@ -1,12 +1,12 @@
-"""Map repair: the curves of a closed map are led through cones that contradict it, the drive is solved again.
+"""Map repair: refit the curves of a closed map through cones that contradict it, and solve the drive again.
 
-A contradiction is a cone that is seen again and again where the closed map has none of its colour. The poses
-are right, held by the other boundary and by the stretches before and after. So the batch of the whole drive
-begins at these poses, with curves through the cones that were seen.
+A contradiction is a cone with repeated detections where the closed map has none of its colour. The other
+boundary and the adjacent stretches still determine the poses. So the batch of the whole drive starts from
+these poses, with curves through the contradicting cones.
 """
 
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.batch.simplification import fit_through
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.graph.changes import place_again
@@ -32,45 +32,39 @@ from pathspace_graph.spline.bspline import BSpline
 from .closing import SIGMA_STEP
 from .known_loop import KnownLoop, Loop
 
-REPAIRED: Final = "the map was repaired"  # beginning of the notice of the cycle in which it was
-SIGHTINGS: Final = 6  # detections of a cone that contradicts the map; clutter has one, a cone passed twenty
-REPAIR_MEMORY: Final = 30.0  # time after its last detection at which a contradiction is forgotten (s)
-CONES: Final = 3  # least number of contradictions in a row that is repaired
+REPAIRED: Final = "the map was repaired"  # beginning of the notice of a repair
+SIGHTINGS: Final = 6  # least number of detections of a contradiction; clutter has 1, a passed cone 20
+REPAIR_MEMORY: Final = 30.0  # time without a detection after which a contradiction is forgotten (s)
+CONES: Final = 3  # least number of contradictions of a repaired stretch
 REPAIR_BESIDE: Final = 0.5  # distance from a curve within which a cone does not contradict it (m)
-CERTAIN: Final = 1.0  # most sigma of a detection that may contradict the map (m): far cones are smeared
-ROW: Final = 11.0  # most distance of neighbours in a row (m): two regular gaps, since one cone may be missed
-SETTLE: Final = 1.5  # time without detections of its cones after which the vehicle has passed a stretch (s)
-MOST: Final = 20  # number of contradictions passed after which enough of a stretch is seen, whatever the time
-REPAIR_INTERVAL: Final = 1.0  # time after which contradictions are looked for again (s)
-REPAIRS: Final = 8  # largest number of attempts to repair a map
-REPLACED: Final = 0.5  # standard deviation of control points that are placed anew on a known map (m)
-BEND: Final = 0.1  # weight of the second difference of their moves
-EXPLAINED: Final = 0.5  # least share of the contradictions that a repaired map explains, or the old one stays
+CERTAIN: Final = 1.0  # largest sigma of a detection that may contradict the map (m)
+ROW: Final = 11.0  # largest distance of neighbours in a row (m): two regular gaps, as a cone may be missed
+SETTLE: Final = 1.5  # time without detections after which a cone counts as passed (s)
+MOST: Final = 20  # number of passed contradictions from which a stretch is repaired before its end
+REPAIR_INTERVAL: Final = 1.0  # time between searches for contradictions (s)
+REPAIRS: Final = 8  # largest number of attempts
+REPLACED: Final = 0.5  # prior standard deviation of moved control points of a known map (m)
+BEND: Final = 0.1  # weight of the second differences of their moves
+EXPLAINED: Final = 0.5  # least share of the contradictions that a repaired map must explain
 
 
 @dataclass(frozen=True, eq=False)
 class ContradictedStretch:
-    """Cones of a boundary's colour that stand in a row beside its curve."""
+    """Row of cones of a boundary's colour that are not on its curve."""
 
     label: int
-    cones: Array  # (k, 2) positions in m, map frame, in no order
+    cones: Array  # (k, 2) positions in m, map frame, unordered
 
 
-class Contradictions:
-    """The detections that no curve of a closed map explains, by label."""
+class Contradictions(Copyable):
+    """Tentative tracks, by label, of the detections that no curve of a closed map explains."""
 
     def __init__(self, settings: GrowthSettings) -> None:
         merging = replace(settings, sightings=SIGHTINGS, forget_after=REPAIR_MEMORY)
         self._tracks = {label: TentativeTracks(merging) for label in BOUNDARIES}
 
-    def copy(self) -> Self:
-        """Return tracks that can go on independently."""
-        other = shallow(self)
-        other._tracks = {label: tracks.copy() for label, tracks in self._tracks.items()}
-        return other
-
     def observe(self, track: CurveMap, loop: Loop, new: slice, t: float) -> None:
-        """Add the new coloured detections, seen at t (s), that are not in use, or are used beside a gap."""
+        """Add the new coloured detections at t (s) that are unused, or used in a gap of their curve."""
         detections, rows = track.detections, np.arange(new.start, new.stop)
         unexplained = ~detections.used[new]
         for label in loop.with_gaps():
@@ -86,14 +80,14 @@ class Contradictions:
             add_by_label(self._tracks, detections.label[rows], points, covariances, t)
 
     def clear(self) -> None:
-        """Forget everything, because the map or the pose was replaced."""
+        """Forget all tracks, since map or pose was replaced."""
         for tracks in self._tracks.values():
             tracks.clear()
 
     def stretches(self, loop: Loop, t: float) -> list[ContradictedStretch]:
-        """Return the stretches whose cones contradict the loop or stand in a gap, once all are passed.
+        """Return the stretches whose cones contradict the loop or are in a gap, once all cones are passed.
 
-        Of a very long one, `MOST` cones passed are enough.
+        A long stretch is complete with `MOST` passed cones.
         """
         found = list[ContradictedStretch]()
         for label, tracks in self._tracks.items():
@@ -116,7 +110,7 @@ class Contradictions:
         return found
 
     def _undisputed(self, label: int, chosen: IntArray) -> BoolArray:
-        """Return which tracks (k,) were seen more often than those of the other colour at the same place."""
+        """Whether the `chosen` tracks (k,) have more detections than those of the other colour there."""
         tracks, other = self._tracks[label], self._tracks[LEFT + RIGHT - label]
         apart = np.hypot(*(tracks.points[chosen, None] - other.points).transpose(2, 0, 1))
         rival = np.where(apart < other.settings.merge_radius, other.counts, 0).max(axis=1, initial=0)
@@ -124,31 +118,25 @@ class Contradictions:
 
 
 def in_rows(points: Array, apart: float) -> list[IntArray]:
-    """Return the groups (k,) of points (n, 2), by index, whose neighbours are at most this far apart (m)."""
+    """Group points (n, 2) by single linkage at distances up to `apart` (m); return indices (k,) by group."""
     pairs = KDTree(points).sparse_distance_matrix(KDTree(points), apart)
     count, group = connected_components(pairs, directed=False)
     return [np.flatnonzero(group == number) for number in range(count)]
 
 
-class MapRepair:
-    """Whether a closed map is contradicted, and the batch that repairs it."""
+class MapRepair(Copyable):
+    """Attempts to repair a closed map."""
 
     def __init__(self, settings: MapperSettings) -> None:
         self.contradictions = Contradictions(settings.growth)
         self._stretches: list[ContradictedStretch] = []
-        self._lap: Array = np.zeros((0, 3))  # the poses of the newest lap as the attempt began
+        self._lap: Array = np.zeros((0, 3))  # poses of the newest lap at the start of the attempt
         self._asked = -np.inf
         self._wait_until = 0.0
         self._attempts = 0
 
-    def copy(self) -> Self:
-        """Return a repair that can go on independently."""
-        other = shallow(self)
-        other.contradictions = self.contradictions.copy()
-        return other
-
     def is_due(self, known: KnownLoop, smoother: CurveSmoother, t: float, driven: float) -> bool:
-        """Return whether the closed map is contradicted at t (s), after a path of this length (m)."""
+        """Whether a repair is due at t (s), after a path of length `driven` (m)."""
         if t < self._asked + REPAIR_INTERVAL or driven < self._wait_until or self._attempts >= REPAIRS:
             return False
         loop, self._asked = known.of(smoother), t
@@ -158,19 +146,19 @@ class MapRepair:
         return bool(self._stretches)
 
     def begin(self, smoother: CurveSmoother, poses: Array) -> ClosedMap:
-        """Return the map that the batch of the drive begins with, with the poses (P, 3) of all cycles."""
+        """Return the initial map of the batch, with the poses (P, 3) of all cycles."""
         smoother.refresh()
         track, state = smoother.map, smoother.map.state
         longest = max(boundary.length for boundary in state.boundaries.values())
         self._lap = poses[lap_begin(poses, longest) :]
-        splines = {label: led_through(track, label, self._stretches, poses) for label in state.boundaries}
+        splines = {label: refitted(track, label, self._stretches, poses) for label in state.boundaries}
         return ClosedMap(splines, poses, state.variables.calibrations.copy())
 
     def in_place(self, smoother: CurveSmoother) -> str:
-        """Lead the curves of a known map through the cones that contradict it, and return the notice.
+        """Refit the curves of a known map through the contradicting cones; return the notice.
 
-        What was known of the control points there is forgotten. No batch of the drive can replace the map,
-        since it has not seen all of it.
+        The prior of the control points there is dropped. No batch can replace the map, since the drive has
+        not covered it.
         """
         stretches, self._stretches = self._stretches, []
         smoother.refresh()
@@ -184,10 +172,10 @@ class MapRepair:
         self._wait_until = 0.0
         names = [NAMES[label] for label in BOUNDARIES if any(one.label == label for one in replaced)]
         count = sum(len(stretch.cones) for stretch in replaced)
-        return f"{REPAIRED}: it is led through {count} other cones on the {' and on the '.join(names)}"
+        return f"{REPAIRED}: it passes through {count} other cones on the {' and on the '.join(names)}"
 
     def end(self, marginal: LapMarginal | None) -> str:
-        """End an attempt; return the notice of a map that explains the contradictions, or an empty one."""
+        """End an attempt; return its notice, which is empty unless the batch explains the contradictions."""
         stretches, self._stretches = self._stretches, []
         if marginal is None:
             return ""
@@ -205,9 +193,9 @@ class MapRepair:
 
 
 def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> bool:
-    """Lead a closed curve through the cones of a stretch, on its own knots; return whether it can be.
+    """Refit a closed curve through the cones of a stretch, on its own knots; return whether they fit.
 
-    The control points there have a wide prior about their new places, and the cones there no stations.
+    The moved control points get a wide prior, and the cones there lose their stations.
     """
     state, label, cones = smoother.map.state, stretch.label, stretch.cones
     boundary, points = state.boundaries[label], state.control_points(label)
@@ -220,7 +208,8 @@ def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> bo
         beyond = ahead_of(middle, at, boundary.length)
         return np.asarray((beyond > low) & (beyond < high))
 
-    moved, every = np.flatnonzero(is_there(boundary.abscissae)), np.arange(*boundary.ends, SAMPLE)
+    tables = boundary.tables
+    moved, every = np.flatnonzero(is_there(boundary.abscissae)), np.arange(tables.low, tables.high, SAMPLE)
     held = every[~is_there(every)]
     at, targets = np.append(u, held), np.concatenate([cones, boundary.evaluate(points, held)])
     basis = boundary.basis(at)[:, moved]
@@ -236,15 +225,15 @@ def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> bo
 
 
 def carried(points: Array, before: Array, after: Array) -> Array:
-    """Return points (k, 2), each moved as the pose next to it has moved, from `before` to `after` (n, 3)."""
+    """Move points (k, 2) rigidly with the nearest pose, from `before` to `after` (n, 3)."""
     nearest = KDTree(before[:, :2]).query(points)[1]
     return to_map(to_vehicle(points, before[nearest]), after[nearest])
 
 
-def led_through(track: CurveMap, label: int, stretches: list[ContradictedStretch], poses: Array) -> BSpline:
-    """Return the closed curve of a boundary, led through the cones of its stretches, none beside them.
+def refitted(track: CurveMap, label: int, stretches: list[ContradictedStretch], poses: Array) -> BSpline:
+    """Fit the closed curve of a boundary through its cones, with those of the stretches replaced.
 
-    The cones are in the order in which the newest lap of the poses (P, 3) passes them.
+    The cones are ordered by the newest lap of the poses (P, 3).
     """
     state, settings = track.state, track.settings
     chosen = [stretch for stretch in stretches if stretch.label == label]
@@ -265,14 +254,14 @@ def led_through(track: CurveMap, label: int, stretches: list[ContradictedStretch
 
 
 def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:
-    """Return the positions (n, 2), the first repeated, and stations (n,) from `lap_begin` to the newest."""
+    """Return positions (n, 2) and stations (n,) of the newest lap; the last position repeats the first."""
     first = lap_begin(poses, length)
     lap = np.concatenate([poses[first:, :2], poses[first : first + 1, :2]])
     return lap, path_lengths(lap)
 
 
 def lap_begin(poses: Array, length: float) -> int:
-    """Return the index of the pose (P, 3) nearest to the newest one, about a lap of a length (m) before."""
+    """Return the index of the pose (P, 3) nearest to the newest one, about a lap (m) earlier."""
     driven = path_lengths(poses)
     before = np.flatnonzero(np.abs(driven[-1] - driven - length) < 0.5 * length)
     away = np.hypot(*(poses[before, :2] - poses[-1, :2]).T)
@@ -280,7 +269,7 @@ def lap_begin(poses: Array, length: float) -> int:
 
 
 def _is_replaced(cones: Array, at: Array, row: Array, row_at: Array, settings: MapperSettings) -> BoolArray:
-    """Return which cones (k, 2) at stations (k,) are those of a row (r, 2), or lie beside it."""
+    """Whether cones (k, 2) at stations (k,) coincide with a row (r, 2), or lie beside it."""
     order, beside = np.argsort(row_at), REPAIR_BESIDE
     away = np.abs(along_and_across(cones, row[order], row_at[order])[1])
     within = (at > row_at.min() - beside) & (at < row_at.max() + beside)

@@ -1,62 +1,44 @@
-"""The open road: its map grows, until a return to its beginning starts the batch that closes the loop."""
+"""The open road: its map grows until a return to its beginning starts the batch that closes the loop."""
 
 from dataclasses import replace
-from typing import ClassVar, Final, Self
+from typing import ClassVar, Final
 
 from pathspace_graph.batch.association import LINE_STEP
-from pathspace_graph.copies import shallow
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.changes import solve_loop
 from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.health import Health
 from pathspace_graph.lengths import joined
 from pathspace_graph.mapping.registration import RefinedMotion
-from pathspace_graph.mapping.road import Classified, Road
+from pathspace_graph.mapping.road import Road
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .closed import Closed
 from .closing import SIGMA_STEP, apply_correspondences, simplify
 from .drive import Drive, Phase, Step
-from .known_loop import evidence_of
 from .lap_solver import Outcome
 from .returns import ReturnFinder
 from .revisit import Revisits
 from .worker import Unsolved
 
-OWN_PRIOR: Final = "the map goes on from the window's own prior"  # begins the notice where no batch came
-STAYS_OPEN: Final = "the loop stays open"  # begins the notice where a batch did not agree
-REVISITED: Final = "the road was met again, and the open map is laid on its earlier pass"
+OWN_PRIOR: Final = "the map goes on from the window's own prior"  # beginning of the notice without a batch
+STAYS_OPEN: Final = "the loop stays open"  # beginning of the notice of a rejected batch
+REVISITED: Final = "the road was driven before: the open map was optimized with the earlier pass"
 """Notice of the first cycle with a revisit."""
 
 
-class Open:
-    """The search for a return, and for road that is met again on the way."""
+class Open(Phase):
+    """Search for a return to the beginning, and for other road that is driven again."""
 
     CLOSED: ClassVar = Closed  # class of the phase after the loop has closed
-    uses_detections = True
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
         self.returns = ReturnFinder(settings.closing)
         self.revisits = Revisits(settings)
-        self.returned_by: Revisit | None = None  # return that began the newest batch
-
-    def copy(self) -> Self:
-        """Return a phase that can go on independently."""
-        other = shallow(self)
-        other.returns = self.returns.copy()
-        other.revisits = shallow(self.revisits)
-        return other
-
-    def judge(
-        self, road: Road, drive: Drive, classified: Classified, reading: Reading
-    ) -> tuple[Phase, Health]:
-        """Judge the estimate by the tested detections."""
-        evidence = evidence_of(road.smoother, classified.tested, None, reading)
-        return self, drive.monitor.update(evidence)
+        self.returned_by: Revisit | None = None  # relative pose that started the newest batch
 
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        """Look for a return, which begins a batch, and go on from the batch or from road met again."""
+        """Search for a return, which starts a batch; apply the batch's result, or a revisit."""
         learned = drive.inflate_priors(road, reading)
         drive.record.estimated(road)
         step = Step(self) if drive.rests(road) else self._step(road, drive, reading, spent)
@@ -74,13 +56,13 @@ class Open:
         revisit = self.revisits.find(road, drive.record, reading.noise)
         if revisit is None:
             return Step(self)
-        notice = "" if drive.revisits else REVISITED  # it is said once
+        notice = "" if drive.revisits else REVISITED  # only the first time
         return Step(self, drive.lay_on(road, revisit), notice)
 
     def _begin_batch(self, road: Road, drive: Drive, reading: Reading) -> None:
-        """Send the lap to a batch where the newest detections, cones or curves lie on earlier ones.
+        """Start a batch of the lap if the newest detections, cones or curves match earlier ones.
 
-        It closes the loop later, if it agrees; until then the map stays open.
+        The map stays open until the batch confirms the match.
         """
         if road.path.length <= self.settings.closing.min_path:
             return
@@ -92,8 +74,8 @@ class Open:
             drive.begin_batch(road, reading, revisit)
 
     def _is_solvable(self, road: Road, drive: Drive) -> bool:
-        """Return whether the lap can be solved as a batch; a lap of too many cones is given up."""
-        cones = sum(  # or of places that stand for those of a line
+        """Whether a batch can solve the lap; one with too many cones is given up."""
+        cones = sum(  # or equivalent places on a line
             boundary.length / LINE_STEP if label in self.settings.lines else len(boundary.cone_parameters)
             for label, boundary in road.boundaries.items()
         )
@@ -104,7 +86,7 @@ class Open:
     # --- closing -----------------------------------------------------------------------------------------
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
-        """Close the loop by a batch that agrees; else it stays open, and the notice says why."""
+        """Close the loop by a batch that confirms it; otherwise the notice says why it stays open."""
         if isinstance(outcome, Unsolved):
             if outcome.is_final:
                 drive.record.give_up(outcome.reason)
@@ -117,7 +99,7 @@ class Open:
         return Step(self.CLOSED(road, drive), jump)
 
     def _close_by_prior(self, road: Road, drive: Drive, found: RefinedMotion) -> Step:
-        """Close the loop by the window's own prior, since no batch can come."""
+        """Close the loop by the window's own prior, as no batch is possible."""
         smoother = road.smoother
         apply_correspondences(smoother, found)
         keyframes = solve_loop(smoother, self.settings.closing.iterations, SIGMA_STEP)

@@ -1,18 +1,18 @@
-"""Finding a vehicle that is lost on a closed map: hypotheses along the loop, until one is left.
+"""Relocalization of a lost vehicle on a closed map, by hypotheses along the loop.
 
-While the vehicle is lost, its detections do not change the map. They are remembered on the path by odometry,
-which is laid rigidly beside each place of the loop, and the best places are refined by the registration. Once
-one is clearly better than all others, twice in a row, the window starts anew there.
+While the vehicle is lost, its detections do not change the map. They are stored on the path by odometry,
+which is aligned rigidly with each place of the loop. Registration refines the best places. Once one is
+clearly better than all others, twice in a row, the window restarts there.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
 from pathspace_graph.batch.association import locate_poses
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import move_points, path_lengths, to_map, wrap_angle
 from pathspace_graph.front_end.front_end import Reading
@@ -26,32 +26,32 @@ from pathspace_graph.mapping.state import State
 
 from .known_loop import MIDDLE_STEP, Loop, lay_out_loop
 
-FOUND: Final = "the vehicle was lost, and is found again"  # notice of the cycle in which it is found
+FOUND: Final = "the vehicle was lost, and is found again"  # notice of a relocalization
 SEARCH_INTERVAL: Final = 0.5  # least time between two attempts (s)
-SEARCH_MEMORY: Final = 60.0  # length of the newest path whose detections are compared with the map (m)
-SEARCH_DETECTIONS: Final = 200  # largest number of detections, evenly chosen, that are compared with the map
-MIN_DETECTIONS: Final = 40  # least number of detections that are compared with the map
-LEAD: Final = 4.0  # distance ahead of the point on the middle of the track that the vehicle heads for (m)
-MISFIT: Final = 3.0  # rms distance of the path driven from the middle within which a place is compared (m)
-REACH: Final = 3.0  # distance from its curve that any farther detection counts as (m)
-SEARCH_STARTS: Final = 12  # largest number of places that are refined
-APART: Final = 4.0  # distance below which two places are one (m)
-SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)  # of the pose about a place, before it is refined (m, m, rad)
-SIGMAS_START: Final = (1.0, 1.0, 0.2)  # of the pose at which a drive is said to begin (m, m, rad)
-SIGMA_FIT: Final = 0.3  # a detection at a distance d from its curve scores `exp(-d^2 / (2 SIGMA_FIT^2))` (m)
-MIN_SCORE: Final = 0.6  # least score of the place that is accepted; the true one has about 0.85
-MARGIN: Final = 0.1  # least lead of its score over that of every other place
-SIGMA_MAX: Final = 0.5  # largest standard deviation of the position there in its worst direction (m)
-CONFIRMATIONS: Final = 2  # attempts, one after the other, that must find the same place
-WIDENING: Final = 3.0  # of the registration's sigmas in the prior there: its detections are used again
-STEPS: Final = 2  # Gauss-Newton steps at the place that was found
+SEARCH_MEMORY: Final = 60.0  # length of the newest path in use (m)
+SEARCH_DETECTIONS: Final = 200  # largest number of detections in use, chosen evenly
+MIN_DETECTIONS: Final = 40  # least number of detections
+LEAD: Final = 4.0  # distance ahead of the vehicle of an additional point of its path (m)
+MISFIT: Final = 3.0  # largest rms distance of the aligned path from the middle of the track (m)
+REACH: Final = 3.0  # largest distance of a detection from its curve; larger ones are clipped (m)
+SEARCH_STARTS: Final = 12  # largest number of refined places
+APART: Final = 4.0  # distance below which two places are the same (m)
+SIGMAS_PLACE: Final = (3.0, 3.0, 0.2)  # prior of the pose at a place, before refinement (m, m, rad)
+SIGMAS_START: Final = (1.0, 1.0, 0.2)  # prior of the given start pose of a drive (m, m, rad)
+SIGMA_FIT: Final = 0.3  # scale of the score `exp(-d^2 / (2 SIGMA_FIT^2))` at a distance d from the curve (m)
+MIN_SCORE: Final = 0.6  # least score of an accepted place; the true one has about 0.85
+MARGIN: Final = 0.1  # least margin of its score over every other place
+SIGMA_MAX: Final = 0.5  # largest standard deviation of the position in its worst direction (m)
+CONFIRMATIONS: Final = 2  # successive attempts that must agree
+WIDENING: Final = 3.0  # inflation of the registration's sigmas in the prior: its detections are used again
+STEPS: Final = 2  # Gauss-Newton steps after the restart
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A place of the map that the newest detections are registered with."""
+    """A place of the map to which the newest detections are registered."""
 
-    score: float  # 0 to 1
+    score: float  # mean score of the detections, 0 to 1
     found: RefinedMotion
 
     def is_near(self, other: "Place") -> bool:
@@ -62,37 +62,30 @@ class Place:
 Choice = Callable[[list[Place] | None], RefinedMotion | None]
 
 
-class Search:
-    """What a lost vehicle has seen, and the search for its place on a closed map."""
+class Search(Copyable):
+    """Search for a vehicle on a closed map, by the path and the detections since its start."""
 
     def __init__(self, road: Road, start: Array | None = None) -> None:
-        """Begin at the newest cycle; the origin of the road's frame may be known to be at `start` (3,)."""
+        """Start at the newest cycle; `start` (3,) is the pose of the road's origin on the map, if known."""
         self.settings, self.start = road.settings, start
         sigmas = SIGMAS_PLACE if start is None else SIGMAS_START
-        self._information = np.diag(np.array(sigmas) ** -2)  # about a place, before it is refined
-        self.first_cycle = road.next_cycle  # cycle from which on detections are remembered
+        self._information = np.diag(np.array(sigmas) ** -2)  # of the prior at a place
+        self.first_cycle = road.next_cycle  # first cycle with stored detections
         self._poses: list[Array] = []
         self._seen: list[Detections] = []
         self._tried = road.smoother.times[-1]  # stamp of the last attempt (s)
-        self._last: Motion | None = None  # of the last attempt
-        self._agreed = 0  # attempts in a row that have found the same place
-        self._missed = 0  # attempts in a row in which no place agreed
-
-    def copy(self) -> Self:
-        """Return a search that can go on independently."""
-        other = shallow(self)
-        other._poses = self._poses.copy()
-        other._seen = self._seen.copy()
-        return other
+        self._last: Motion | None = None  # result of the last attempt
+        self._agreed = 0  # successive attempts with the same result
+        self._missed = 0  # successive attempts without an agreeing place
 
     def look(self, road: Road, classified: Classified, reading: Reading) -> None:
-        """Remember the newest cycle of a road, with its detections as the calibration corrects them."""
+        """Store the newest cycle of a road, with detections corrected by the calibration."""
         track = road.smoother.map
         corrected = track.detections.corrected(classified.new, track.variables.sensor).copy()
         self.observe(road.poses[-1], replace(reading.detections, points_vehicle=corrected))
 
     def observe(self, pose: Array, detections: Detections) -> None:
-        """Remember a cycle: its pose (3,) by odometry, and its detections."""
+        """Store a cycle: its pose (3,) by odometry, and its detections."""
         self._poses.append(pose.copy())
         self._seen.append(detections)
         driven = path_lengths(np.array(self._poses))
@@ -100,9 +93,9 @@ class Search:
         del self._poses[:old], self._seen[:old]
 
     def find(self, smoother: CurveSmoother, choose: Choice | None = None) -> RefinedMotion | None:
-        """Return the motion onto the only place that agrees, once it was found several times in a row.
+        """Return the motion onto the map once successive attempts agree.
 
-        Of the places, the best first, `choose` returns the one that agrees, by default by their scores.
+        `choose` selects a place from a list, best first; the default is `by_score`.
         """
         if not self._seen or self._seen[-1].t - self._tried < SEARCH_INTERVAL:
             return None
@@ -117,21 +110,21 @@ class Search:
         return best if self._agreed >= CONFIRMATIONS else None
 
     def widened(self, found: RefinedMotion) -> Array:
-        """Return the covariance (3, 3) of a place, whose detections are used once more in the window."""
+        """Return the covariance (3, 3) at a place, inflated since the window uses the detections again."""
         seen = np.linalg.inv(found.covariance) - self._information
         return np.asarray(np.linalg.inv(seen / WIDENING**2 + self._information), np.float64)
 
     @property
     def is_off_map(self) -> bool:
-        """Return whether no place of the map agrees with what was seen, several times in a row."""
+        """Whether no place of the map has agreed in successive attempts."""
         return self._missed >= CONFIRMATIONS
 
     def _places(self, smoother: CurveSmoother) -> list[Place] | None:
-        """Return the likeliest places, the best first; None where too little was seen."""
+        """Return the likeliest places, best first; None with too few detections."""
         seen = self._sightings()
         if len(seen.rows) < MIN_DETECTIONS:
             return None
-        smoother.refresh()  # the map goes on to relax from the detections that were taken out of use
+        smoother.refresh()  # the map still relaxes after the release of detections
         state, loop = smoother.map.state, lay_out_loop(smoother.map)
         centre = self._poses[-1][:2]
         starts = [(Motion(centre, vector), i) for vector, i in self._starts(loop, seen)]
@@ -139,7 +132,7 @@ class Search:
         return sorted(places, key=lambda place: -place.score)
 
     def by_score(self, places: list[Place] | None) -> RefinedMotion | None:
-        """Return the motion onto the place that is clearly better than all others, if there is one."""
+        """Return the motion onto a place that is clearly better than all others, if there is one."""
         if places is None:
             return None
         if not places or places[0].score < MIN_SCORE:
@@ -149,7 +142,7 @@ class Search:
         rivals = [place.score for place in places if not place.is_near(best)]
         if rivals and rivals[0] > best.score - MARGIN:
             return None
-        if self.start is not None:  # which says what the curves leave free
+        if self.start is not None:  # the start determines what the curves do not
             return best.found
         return best.found if worst_sigma(best.found.covariance) < SIGMA_MAX else None
 
@@ -165,7 +158,7 @@ class Search:
     # --- hypotheses --------------------------------------------------------------------------------------
 
     def _starts(self, loop: Loop, seen: Sightings) -> list[tuple[Array, int]]:
-        """Return motions (3,) onto the likeliest places, each with the index of its point of the middle."""
+        """Return motions (3,) onto the likeliest places, each with the index of its point on the middle."""
         if self.start is not None:
             return [self._at_start(loop, self.start)]
         motions, misfit = self._beside(loop)
@@ -180,14 +173,14 @@ class Search:
         return [(motions[i], int(i)) for i in _spread(loop, possible, cost)]
 
     def _at_start(self, loop: Loop, start: Array) -> tuple[Array, int]:
-        """Return the motion (3,) of the origin to `start` (3,), and the nearest point of the middle."""
+        """Return the motion (3,) of the origin to `start` (3,), and the index of the nearest point."""
         newest = self._poses[-1][:2]
         there = move_points(start, newest[None])[0]
         nearest = int(np.hypot(*(loop.middle - there).T).argmin())
         return np.append(there - newest, start[2]), nearest
 
     def _beside(self, loop: Loop) -> tuple[Array, Array]:
-        """Return motions (n, 3) that fit the path to the middle before its points, and rms misfits (n,)."""
+        """Align the path with the middle up to each point; return motions (n, 3) and misfits (n,) in m."""
         poses = np.array(self._poses)
         behind = np.append(np.hypot(*np.diff(poses[:, :2], axis=0).T)[::-1].cumsum()[::-1], 0.0)
         _, first = np.unique(behind // MIDDLE_STEP, return_index=True)
@@ -203,10 +196,10 @@ class Search:
         return np.column_stack([shift.real, shift.imag, np.angle(turn)]), np.sqrt((misfit**2).mean(axis=1))
 
     def _refined(self, state: State, loop: Loop, seen: Sightings, start: Motion, i: int) -> Place:
-        """Return the place that is registered from a motion onto point `i` of the middle."""
+        """Register the detections from an initial motion onto point `i` of the middle."""
         gate, stretches = self.settings.gate, dict[int, tuple[float, float]]()
         driven = float(path_lengths(np.array(self._poses))[-1])
-        for label, u in loop.beside.items():  # what the vehicle has seen on a path that ends there
+        for label, u in loop.beside.items():  # the stretch in view on a path that ends there
             tables = state.boundaries[label].tables
             low = float(u[i]) - driven - gate.station_room
             high = float(u[i]) + gate.view_ahead + gate.station_room
@@ -221,7 +214,7 @@ class Search:
 
 
 def _spread(loop: Loop, places: IntArray, cost: Array) -> list[int]:
-    """Return the places of least cost that are no nearer to each other than `APART`."""
+    """Return the places of least cost that are at least `APART` from each other."""
     chosen = list[int]()
     for i in places[np.argsort(cost)].tolist():
         away = np.abs(loop.stations[chosen] - loop.stations[i])
@@ -232,11 +225,11 @@ def _spread(loop: Loop, places: IntArray, cost: Array) -> list[int]:
     return chosen
 
 
-def start_anew(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) -> Array:
-    """Move the window onto the place that was found, and return the jump (3,) of the newest pose.
+def restart_window(smoother: CurveSmoother, first_cycle: int, found: RefinedMotion) -> Array:
+    """Move the window to the place found; return the jump (3,) of the newest pose.
 
-    The poses before `first_cycle` leave the window. The map and its prior stay; what the prior says about the
-    poses is replaced by the covariance of the registration.
+    The poses before `first_cycle` leave the window. The prior of the map stays; that of the poses is replaced
+    by the covariance of the registration.
     """
     state, settings = smoother.map.state, smoother.map.settings
     forget_poses(smoother, first_cycle)

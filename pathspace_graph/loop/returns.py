@@ -1,12 +1,12 @@
-"""The return to the beginning of a drive, by the newest curves or cones, or by the shape of the road."""
+"""Search for a return to the beginning of a drive: by curves, by cones, or by the shape of the road."""
 
 from math import inf
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
 from pathspace_graph.batch.start import unwrap
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.relative import Revisit
@@ -27,35 +27,29 @@ from pathspace_graph.settings.online import ClosingSettings
 from .drive_record import DriveRecord
 from .revisit import recognize
 
-PLACED: Final = 20.0  # path for which a vehicle stays so certain that only detections can close the loop (m)
-RECOGNITION_INTERVAL: Final = 10.0  # least distance of two attempts to recognize the place (m along the path)
-RETURN_CYCLES: Final = 10  # least number of cycles of two attempts to find the beginning again by its cones
+CERTAIN_PATH: Final = 20.0  # path after which the certainty of a pose is checked again (m)
+RECOGNITION_INTERVAL: Final = 10.0  # distance between attempts by shape (m along the path)
+RETURN_CYCLES: Final = 10  # number of cycles between attempts by cones
 LONG_PATH: Final = 1000.0
-"""Path from which on the distance of attempts grows with it (m), as the cost of an attempt does."""
+"""Path length (m) from which `RECOGNITION_INTERVAL` grows in proportion, as the cost of an attempt does."""
 
 
-class ReturnFinder:
-    """The search for a return of an open road, in three ways, of which one at most is tried in a cycle."""
+class ReturnFinder(Copyable):
+    """Search for a return of an open road in three ways, at most one of them per cycle."""
 
     def __init__(self, settings: ClosingSettings) -> None:
         self._settings = settings
         self._tried = dict.fromkeys(("curves", "cones", "shape"), (-inf, 0))
-        """Path (m) and cycle of the last attempt in each way."""
-        self._rests_until = 0.0  # path (m)
-        self._placed_until = 0.0  # path (m) up to which the vehicle is not lost (`is_lost`)
-
-    def copy(self) -> Self:
-        """Return a search that can go on independently."""
-        other = shallow(self)
-        other._tried = self._tried.copy()
-        return other
+        """Path length (m) and cycle of the last attempt in each way."""
+        self._rests_until = 0.0  # path length of the next attempt (m)
+        self._certain_until = 0.0  # path length up to which the pose counts as certain (m)
 
     def rest(self, road: Road, length: float) -> None:
-        """Look for no return for a length (m) from here on; zero ends a rest."""
+        """Pause the search for a length (m) from here; zero ends the pause."""
         self._rests_until = road.path.length + length if length else 0.0
 
     def find(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
-        """Return the newest pose beside an earlier one, in the way that is due and has waited longest."""
+        """Return the newest pose relative to an earlier one, by the due way that has waited longest."""
         for way in sorted(self._tried, key=lambda one: self._tried[one][0]):
             if not self._is_due(road, way):
                 continue
@@ -67,29 +61,29 @@ class ReturnFinder:
         return None
 
     def by_curves(self, road: Road) -> RefinedMotion | None:
-        """Return the motion that lays the newest detections on the beginning of the curves, if it is due."""
+        """Return the motion of the newest detections onto the beginning of the curves, if a check is due."""
         return self._by_curves(road) if self._is_due(road, "curves") else None
 
     def _by_curves(self, road: Road) -> RefinedMotion | None:
         smoother, path, settings = road.smoother, road.path, self._settings
         smoother.transform_to_origin()
         track, times = smoother.map, smoother.times
-        if path.length < self._placed_until and not is_within_reach(track, times, settings):
-            return None  # the covariance would be costly
+        if path.length < self._certain_until and not is_within_reach(track, times, settings):
+            return None  # saves a costly covariance
         covariance = smoother.newest_covariance()
         if not is_lost(covariance, settings):
-            self._placed_until = path.length + PLACED
+            self._certain_until = path.length + CERTAIN_PATH
         found = register(track, times, covariance, path.beginning, settings)
         return found if found is not None and passes_start(track.state, path, found.motion) else None
 
     def _by_cones(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
-        """Return the newest pose beside an early one, if the newest cones lie on those of the beginning."""
+        """Return the newest pose relative to an early one, if its cones match those of the beginning."""
         covariance = road.smoother.newest_covariance()
         seen_in = record.seen_in(road.smoother.variables.sensor, noise)
         return return_to_beginning(seen_in, unwrap(record.poses), covariance, road.settings)
 
     def _revisit_of(self, road: Road, record: DriveRecord, found: RefinedMotion, within: float) -> Revisit:
-        """Return the newest pose, once moved, beside the nearest one `within` the first metres."""
+        """Return the moved newest pose relative to the nearest pose on the first `within` metres."""
         poses = record.with_window(road)
         newest = poses[-1:].copy()
         found.motion.move(newest)
@@ -100,7 +94,7 @@ class ReturnFinder:
         return relative_pose(*ends, newest[0], information)
 
     def _is_due(self, road: Road, way: str) -> bool:
-        """Return whether to look for a return in a way again, some metres or cycles after the last time."""
+        """Whether a way is due, some metres or cycles after its last attempt; if so, record the attempt."""
         length, cycle = road.path.length, road.next_cycle
         tried, tried_cycle = self._tried[way]
         interval = self._settings.check_interval

@@ -1,13 +1,12 @@
-"""Places that are met again while the loop is open: by another way, or after a lap, by its shape.
+"""Place recognition on an open road: by cones after another way there, or by shape after a lap.
 
-A lap closes where it began. The second round of a skidpad does not, nor does a lane that leads into a
-circuit. There the cones of the last metres are laid on those of the earlier pass
-(`mapping.constellation`), which gives a factor between two poses (`graph.relative:Revisit`). The open map
-is optimized with it as with a closed loop, but goes on to grow.
+A lap closes where it began, but the second round of a skidpad does not, nor does a lane that leads into a
+circuit. There the cones of the last metres are registered to those of the earlier pass
+(`mapping.constellation`), which gives a factor between two poses (`graph.relative:Revisit`). The open map is
+optimized with it as with a closed loop, and continues to grow.
 
 After a long lap the vehicle may be anywhere along the first few hundred metres, and the detections of the
-last seconds agree with any place along a straight there. The bends in the newest stretch of the curves tell
-the place.
+last seconds fit any place along a straight. The bends in the newest stretch of the curves identify the place.
 """
 
 from dataclasses import replace
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pathspace_graph.batch.start import REVISIT_INTERVAL
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import (
     compose,
@@ -55,22 +55,23 @@ from pathspace_graph.settings.online import ClosingSettings
 from .closing import SIGMA_STEP
 from .drive_record import DriveRecord
 
-REVISIT_ATTEMPTS: Final = 3.0  # least distance of two attempts (m along the path)
-RETURN: Final = 30.0  # least length of the path between both passes (m)
-RADIUS: Final = 4.0  # largest distance of both passes, as the map has them (m)
-DIVERGED: Final = 8.0  # distance that the ways to the place must have had, as seen from the place (m)
-WAY, WAY_STEP = 100.0, 4.0  # length of the ways that are compared, and the step at which they are (m)
+REVISIT_ATTEMPTS: Final = 3.0  # distance between attempts (m along the path)
+RETURN: Final = 30.0  # least path length between both passes (m)
+RADIUS: Final = 4.0  # largest distance between both passes in the map (m)
+DIVERGED: Final = 8.0  # least separation of the ways to both passes, seen from the place (m)
+WAY: Final = 100.0  # length of the compared ways (m)
+WAY_STEP: Final = 4.0  # step of their points (m)
 
 
-class Revisits:
-    """The search for road of an open drive that is met again."""
+class Revisits(Copyable):
+    """Search for road that an open drive revisits."""
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
-        self._next = RETURN  # path (m) from which on the next one is looked for
+        self._next = RETURN  # path length of the next attempt (m)
 
     def find(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
-        """Return a new revisit, if it is time to look for one, and the window's oldest pose has one."""
+        """Return a revisit by the oldest pose of the window, if an attempt is due and finds one."""
         smoother, length = road.smoother, road.path.length
         if length < self._next or record.unsolvable is not None:
             return None
@@ -86,7 +87,7 @@ class Revisits:
         return revisit
 
     def _measured(self, smoother: CurveSmoother, seen_in: SeenIn, poses: Array, place: int) -> Revisit | None:
-        """Return the oldest pose of the window, as seen from the keyframe next to an earlier place."""
+        """Return the oldest pose of the window relative to the keyframe nearest to an earlier place."""
         laid = lay_newest(seen_in, poses, place, NEARBY, self.settings.growth)
         if laid is None or not laid.is_sure:
             return None
@@ -96,7 +97,7 @@ class Revisits:
 
 
 def lay_on(road: Road, record: DriveRecord, revisit: Revisit) -> Array:
-    """Optimize an open map with a revisit, and return the jump (3,) of the newest pose."""
+    """Optimize an open map with a revisit; return the jump (3,) of the newest pose."""
     before = road.poses[-1].copy()
     iterations = road.settings.closing.iterations
     keyframes = solve_revisit(road.smoother, revisit.factor(), iterations, SIGMA_STEP)
@@ -107,9 +108,9 @@ def lay_on(road: Road, record: DriveRecord, revisit: Revisit) -> Array:
 
 
 def earlier_pass(poses: Array) -> int | None:
-    """Return the nearest cycle of the first earlier pass of the newest pose (P, 3), if another way led there.
+    """Return the nearest cycle of the first earlier pass by the newest of the poses (P, 3), if there is one.
 
-    Where the ways to both passes never part, the drive has come by way of its start, as a lap does.
+    The ways to both passes must part: otherwise the drive came past its start, as in a lap.
     """
     newest = poses[-1]
     near = np.hypot(*(poses[:, :2] - newest[:2]).T) < RADIUS
@@ -127,7 +128,7 @@ def earlier_pass(poses: Array) -> int | None:
 
 
 def have_parted(poses: Array, stations: Array, place: int) -> bool:
-    """Return whether the ways to the newest of the poses (P, 3) and to an earlier place were apart."""
+    """Whether the ways to the newest of the poses (P, 3) and to an earlier one at `place` part."""
     back, ways = np.arange(0.0, min(float(stations[place]), WAY), WAY_STEP), []
     for cycle in (place, -1):
         at = stations[cycle] - back
@@ -136,21 +137,21 @@ def have_parted(poses: Array, stations: Array, place: int) -> bool:
     return bool((np.hypot(*(ways[0] - ways[1]).T) > DIVERGED).any())
 
 
-# --- the recognition of a place --------------------------------------------------------------------------
+# --- recognition by shape --------------------------------------------------------------------------------
 
-STRETCH: Final = 150.0  # length at the end of the curves that is registered (m): its bends tell the place
-STRETCH_ROOM: Final = 10.0  # beyond the ends of the earlier stretch in which foot points are searched (m)
-SIGMAS_BENT: Final = (1.5, 1.5, 0.15)  # of the newest pose in the stretch behind it (m, m, rad)
-STRETCHES: Final = 6  # most earlier stretches, alike in their turns, that it is registered with
+STRETCH: Final = 150.0  # length of the registered stretch at the end of the curves (m)
+STRETCH_ROOM: Final = 10.0  # search range of foot points beyond the ends of the earlier stretch (m)
+SIGMAS_BENT: Final = (1.5, 1.5, 0.15)  # drift of the newest pose within its stretch (m, m, rad)
+STRETCHES: Final = 6  # largest number of earlier stretches to register to, most similar first
 
 
 def recognize(smoother: CurveSmoother) -> RefinedMotion | None:
-    """Return the motion of `find_place`; None if there is none, or the vehicle is not lost.
+    """Return the motion of `find_place`, or None if there is none or the pose is certain.
 
-    The newest stretch was laid as it is, but odometry has bent it, so the covariance is wider.
+    The registration is rigid although odometry has bent the newest stretch, so the covariance is inflated.
     """
     settings, track = smoother.map.settings.closing, smoother.map
-    if set(track.state.boundaries) != set(BOUNDARIES) or not may_tell_place(track.state, settings):
+    if set(track.state.boundaries) != set(BOUNDARIES) or not is_recognizable(track.state, settings):
         return None
     smoother.transform_to_origin()
     covariance = smoother.newest_covariance()
@@ -158,10 +159,10 @@ def recognize(smoother: CurveSmoother) -> RefinedMotion | None:
     return found and replace(found, covariance=found.covariance + np.diag(SIGMAS_BENT) ** 2)
 
 
-def may_tell_place(state: State, settings: ClosingSettings) -> bool:
-    """Return whether a lap lies between an earlier stretch and the newest one, and this may tell a place.
+def is_recognizable(state: State, settings: ClosingSettings) -> bool:
+    """Whether the newest stretch is a lap past the earlier ones and bends enough to fix a pose.
 
-    Laid on itself, the newest stretch must hold the vehicle in every direction, as no straight does.
+    Registered to itself, it must constrain the pose in every direction; a straight does not.
     """
     end = min(boundary.confirmed_end for boundary in state.boundaries.values())
     if not STRETCH < BEGINNING_SHARE * end < end - STRETCH - settings.min_path:
@@ -173,15 +174,14 @@ def may_tell_place(state: State, settings: ClosingSettings) -> bool:
 
 
 def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) -> RefinedMotion | None:
-    """Return the only motion by which the newest stretch of the curves lies on an earlier stretch.
+    """Register the newest stretch of the curves to an earlier one, within the pose's `covariance` (3, 3).
 
-    It is searched for within the `covariance` (3, 3) of the newest pose. None if no place agrees, if several
-    do, or if the place along the track is uncertain.
+    None if no place agrees, if several do, or if the position along the track is uncertain.
     """
     state = track.state
     newest = {label: cones for label, (cones, _) in newest_stretch(state).items()}
     centre = state.poses[-1, :2].copy()
-    # a lap away the heading turns the position on an arc, which correlations follow only for small angles
+    # after a lap the heading moves the position on an arc, which correlations describe for small angles only
     variance = np.linalg.eigvalsh(covariance[:2, :2])[-1]
     wide = np.diag([variance, variance, covariance[2, 2]])
     prior = np.asarray(np.linalg.inv(wide * settings.prior_scale**2), np.float64)
@@ -193,7 +193,7 @@ def find_place(track: CurveMap, covariance: Array, settings: ClosingSettings) ->
         if found is None:
             found = place
         elif np.hypot(*(place.motion.vector - found.motion.vector)[:2]) >= settings.overlap:
-            return None  # two places are enough
+            return None  # the place is ambiguous
     return found
 
 
@@ -210,10 +210,10 @@ def newest_stretch(state: State) -> dict[int, tuple[Array, Array]]:
 
 
 def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple[Array, float]]:
-    """Return motions (3,) onto earlier stretches that turn as the newest one does, most similar first.
+    """Return motions (3,) onto earlier stretches with similar turns, most similar first.
 
-    Each goes with the parameter at which the earlier stretch of the first boundary begins. The headings along
-    both stretches are compared, after a common turn.
+    Each comes with the first parameter of the earlier stretch on the first boundary. The similarity compares
+    the headings along both stretches, up to a common turn.
     """
     (label, boundary), step = next(iter(state.boundaries.items())), START_STEP
     u = np.arange(boundary.confirmed_end % step, boundary.confirmed_end, step)
@@ -232,7 +232,7 @@ def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple
 
 
 def _minima(values: Array, apart: int) -> list[int]:
-    """Return the indices of finite values that are the least of all that are as near as `apart`."""
+    """Return the indices of finite values that are minima within `apart` indices, least value first."""
     padded = np.pad(values, apart, constant_values=np.inf)
     least = sliding_window_view(padded, 2 * apart + 1).min(axis=1)
     found = np.flatnonzero(np.isfinite(values) & (values == least))
@@ -242,7 +242,7 @@ def _minima(values: Array, apart: int) -> list[int]:
 def _register(
     state: State, newest: dict[int, Array], start: Motion, low: float, prior: Array, settings: ClosingSettings
 ) -> RefinedMotion | None:
-    """Return the motion of the newest cones, registered from a start whose first boundary begins at `low`."""
+    """Register the newest cones from a start; the earlier stretch begins at `low` on the first boundary."""
     first, boundary = next(iter(state.boundaries.items()))
     corners = boundary.evaluate(state.control_points(first), np.array([low, low + STRETCH]))
     stretches = {label: _between(state, label, corners) for label in state.boundaries}
@@ -257,7 +257,7 @@ def _register(
 
 
 def _between(state: State, label: int, corners: Array) -> tuple[float, float]:
-    """Return the parameters of the stretch of a boundary between two points (2, 2), and some room."""
+    """Return the parameters of a boundary's stretch between two points (2, 2), widened by `STRETCH_ROOM`."""
     boundary = state.boundaries[label]
     high = np.full(len(corners), BEGINNING_SHARE * boundary.confirmed_end)
     u = boundary.find(state.control_points(label), corners, np.zeros(len(corners)), high).u

@@ -1,12 +1,11 @@
-"""A known map: the vehicle's place on it is searched, while a road of its own is mapped."""
+"""A known map: search the vehicle's place on it, and map a separate road meanwhile."""
 
 from functools import partial
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
 from pathspace_graph.batch.known_map import KnownMap
-from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import Reading
@@ -20,52 +19,43 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .closed import Closed
 from .drive import Drive, Phase, Step
-from .known_loop import evidence_of
 from .lap_solver import Outcome
 from .open import Open
 from .relocalization import Place, Search
 
-SEEKING: Final = "the vehicle is not found on the known map yet"  # reason of the health until then
-PLACED: Final = "the vehicle is found on the known map"  # notice of the cycle in which it is
+SEEKING: Final = "the vehicle is not found on the known map yet"  # reason of the health during the search
+PLACED: Final = "the vehicle is found on the known map"  # notice of the localization
 
-PLACES: Final = 4  # places by the curves on which the cones are laid
+PLACES: Final = 4  # places by curves that are checked by cones
 ANYWHERE_CONES: Final = 12
-"""Least number of cones that tell a place anywhere on a map, twice as many as where odometry has it about."""
+"""Least number of matched cones; half of them are enough where odometry gives the approximate place."""
 ANYWHERE_PATH: Final = 20.0
-"""Least length of the path driven (m): two roads of one width and spacing may be alike for a bend."""
-CURVES_PATH, CURVES_SCORE = 50.0, 0.75
-"""Least length of the path driven (m) and score of a place by the curves alone. Then no place on the map of
-another track had more than 0.71, and those on the right map had 0.66 to 0.89."""
+"""Least path length (m): two roads of equal width and spacing may look alike for one bend."""
+CURVES_PATH: Final = 50.0  # least path length for a place by curves alone (m)
+CURVES_SCORE: Final = 0.75
+"""Least score of a place by curves alone. Places had at most 0.71 on maps of other tracks, and 0.66 to 0.89
+on the right map."""
 NEAR: Final = Expected.within(8.0, 0.3, (2.0, 2.0, 0.1))
-"""How far from the place that the curves tell the one that the cones tell may be."""
+"""Largest difference between the places by curves and by cones."""
 
 
-class Seeking:
-    """An open road of the vehicle's own, and the search for its place on a known map."""
-
-    uses_detections = True
+class Seeking(Phase):
+    """Search for the vehicle's place on a known map, with an open road of its own."""
 
     def __init__(
         self, settings: MapperSettings, track: Map, start: Array | None = None, keep: bool = False
     ) -> None:
         self.known = known = KnownMap.of(track, keep, settings.lines)
-        self.start = start  # pose (3,) of the known map at which the drive began, if it is known
+        self.start = start  # (3,) start pose of the drive on the known map, if given
         self.own: Phase = Open(settings)
         self._known = known.smoother(settings)
         self._cones = known.constellation
         self._search: Search | None = None
 
-    def copy(self) -> Self:
-        """Return a phase that can go on independently."""
-        other = shallow(self)
-        other.own = self.own.copy()
-        other._search = self._search and self._search.copy()
-        return other
-
     def judge(
         self, road: Road, drive: Drive, classified: Classified, reading: Reading
     ) -> tuple[Phase, Health]:
-        """Judge the road of its own, and remember what is seen."""
+        """Judge the own road, and record the detections for the search."""
         self.own, health = self.own.judge(road, drive, classified, reading)
         if self._search is None:
             self._search = Search(road, self.start)
@@ -73,10 +63,10 @@ class Seeking:
         return self, Health(DEGRADED, SEEKING) if health.condition == GOOD else health
 
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        """Lay the road on the known map where its place is found; else go on with it alone."""
+        """Replace the own road by the known map once its place is found; otherwise continue with it."""
         step = self.own.step(road, drive, reading, spent)
         if step.jump is not None:
-            self._search = None  # what was seen is no longer where it was
+            self._search = None  # the recorded path is no longer valid
         self.own = step.phase
         if road.closed:
             return step
@@ -90,7 +80,7 @@ class Seeking:
     def _place(self, road: Road, drive: Drive, reading: Reading) -> tuple[Motion, Array] | None:
         """Return the motion onto the known map, and the covariance (3, 3) of the newest pose there.
 
-        The cones must agree as well where those of the map are known.
+        If the map has cones, they must agree as well.
         """
         search = self._search
         if search is None:
@@ -105,7 +95,7 @@ class Seeking:
         return None if found is None else (found.motion, search.widened(found))
 
     def _by_curves(self, road: Road, search: Search, places: list[Place] | None) -> RefinedMotion | None:
-        """Return the motion onto the place of a map without cones: it takes a long road that fits well."""
+        """Return the motion onto a place of a map without cones, after a long path with a good fit."""
         if not places or road.path.length < CURVES_PATH or places[0].score < CURVES_SCORE:
             return None
         return search.by_score(places)
@@ -113,7 +103,7 @@ class Seeking:
     def _by_cones(
         self, road: Road, drive: Drive, reading: Reading, known: Constellation, places: list[Place] | None
     ) -> RefinedMotion | None:
-        """Return the motion onto the only one of the best places where the newest cones lie on known ones."""
+        """Return the motion onto the only one of the best places where the newest cones match known ones."""
         record, newest = drive.record, road.poses[-1]
         if not places or record.unsolvable is not None or road.path.length < ANYWHERE_PATH:
             return None
@@ -136,30 +126,9 @@ class Seeking:
         return agree[0] if len(agree) == 1 else None
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
-        """Go on from a batch of the road of its own."""
+        """Continue from a batch of the own road."""
         return self.own.take(road, drive, outcome)
 
 
-class OnOpenMap:
-    """A known map that is open: it is localized on and refined, and grows past a tentative end."""
-
-    uses_detections = True
-
-    def copy(self) -> Self:
-        """Return the phase itself, which has no state."""
-        return self
-
-    def judge(
-        self, road: Road, drive: Drive, classified: Classified, reading: Reading
-    ) -> tuple[Phase, Health]:
-        """Judge the estimate by the tested detections."""
-        return self, drive.monitor.update(evidence_of(road.smoother, classified.tested, None, reading))
-
-    def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        """Remember the pose."""
-        drive.record.estimated(road)
-        return Step(self)
-
-    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
-        """Leave the map as it is."""
-        return Step(self)
+class OnOpenMap(Phase):
+    """Localization on a known open map, which is refined and grows past a tentative end."""

@@ -1,4 +1,4 @@
-"""The process that solves laps: one lap at a time, handed over, waited for, or taken from it."""
+"""The process that solves laps: submit one lap at a time, wait for it, or cancel it."""
 
 import os
 import signal
@@ -20,51 +20,51 @@ from joblib.externals.loky.backend import resource_tracker as loky_tracker
 from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
 from pathspace_graph.errors import SingularSystemError
 
-WORKER_IDLE: Final = 600  # time with nothing to do after which the process that solves laps ends (s)
-WATCH_SECONDS: Final = 1.0  # at which a worker checks whether the process that started it is still there
-SOLVED: Final = 3.0  # distance from the optimum of a solved batch (joint sigmas): its marginal has the rest
+WORKER_IDLE: Final = 600  # idle time after which the process ends (s)
+WATCH_SECONDS: Final = 1.0  # interval at which a worker checks that its parent is alive (s)
+SOLVED: Final = 3.0  # largest distance of a usable result from its optimum (joint sigmas)
 
 
 @dataclass(frozen=True)
 class Unsolved:
-    """Why there is no marginal of a lap."""
+    """Failure of a batch."""
 
     reason: str
-    is_final: bool = True  # whether another attempt, after more of the drive, would fail as well
+    is_final: bool = True  # whether a later attempt would fail as well
 
 
 BATCH_LATE: Final = Unsolved("the batch of the lap was late")
 
 
 class LapBatch:
-    """A lap that is being solved in a process of its own, while the mapper goes on."""
+    """Lap that another process solves while the mapper continues."""
 
     def __init__(self, lap: OpenLap, t: float, due: int, last: int) -> None:
-        self.t = t  # stamp of the cycle in which the lap was sent (s)
-        self.due, self.last = due, last  # first and last cycle in which the marginal may replace the prior
-        self.first_kept = lap.first_kept  # cycle from which on the window holds the poses until then
+        self.t = t  # stamp of the cycle that sent the lap (s)
+        self.due, self.last = due, last  # first and last cycle in which the result may be used
+        self.first_kept = lap.first_kept  # first cycle whose pose stays in the window until then
         self._lap = lap
         self._future: Future[LapMarginal] | None = None
         self.send()
 
     def send(self) -> Future[LapMarginal]:
-        """Hand the lap to the process, unless it has it already; a snapshot holds the lap alone."""
+        """Submit the lap unless it is submitted already; a snapshot stores the lap alone."""
         if self._future is None:
             self._future = submit(solve_lap, self._lap)
         return self._future
 
     def wait(self) -> None:
-        """Wait for the process, however long it takes."""
+        """Wait for the result without limit."""
         wait([self.send()])
 
     def give_up(self) -> None:
-        """Take the lap from the process, which is ended if it is at it; the next lap has a new one then."""
+        """Cancel the lap; if the process already solves it, end the process."""
         future = self.send()
         if not future.done() and not future.cancel():
             _end_worker()
 
     def marginal(self, timeout: float) -> LapMarginal | Unsolved | None:
-        """Return the solution, or why there is none, or None if it is not there after a time (s)."""
+        """Return the solution or the failure; None if there is neither after a `timeout` (s)."""
         try:
             solved = self.send().result(timeout)
         except TimeoutError:
@@ -73,7 +73,7 @@ class LapBatch:
             return Unsolved(str(error), is_final=False)
         except BrokenProcessPool:
             return Unsolved("the process of the batch has died")
-        except Exception as error:  # a vehicle drives on, whatever has failed there
+        except Exception as error:  # the vehicle drives on, whatever fails
             failed = f"the batch of the lap has failed: {type(error).__name__}: {error}"
             return Unsolved(" ".join(failed.split()))
         nearly = solved.convergence.converged or solved.convergence.gradient < SOLVED
@@ -81,13 +81,13 @@ class LapBatch:
 
 
 def submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """Hand work to the process that solves laps, a new one if it has died; if none begins, the work fails."""
+    """Submit work to the process, a new one if it has died; the future fails if none can be started."""
     failed = cast("Future[Any]", loky.Future())
     for _ in range(2):
         try:
             with _spared_by_interrupts():
                 return cast("Future[Any]", _worker().submit(work, *arguments))
-        except Exception as error:  # it has died, or cannot be begun
+        except Exception as error:  # the process has died, or cannot be started
             _worker.cache_clear()
             failure = error
     failed.set_exception(failure)
@@ -96,12 +96,12 @@ def submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
 
 @contextmanager
 def _spared_by_interrupts() -> Iterator[None]:
-    """Let processes begin that Ctrl-C does not reach, lest each prints where it was; it waits meanwhile."""
+    """Block SIGINT, so that processes started within ignore Ctrl-C and print no traceback."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
     for tracker in (resource_tracker, loky_tracker):
-        tracker.ensure_running()  # else it would be begun within, and let signals through
+        tracker.ensure_running()  # if started within, it would unblock signals
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -111,19 +111,19 @@ def _spared_by_interrupts() -> Iterator[None]:
 
 @cache
 def _worker() -> Any:
-    if current_process().daemon:  # it may have no children: a worker of Dask is one
+    if current_process().daemon:  # such as a worker of Dask, which may have no children
         return ThreadPoolExecutor(max_workers=1)
     executor = loky.ProcessPoolExecutor(
         max_workers=1, timeout=WORKER_IDLE, initializer=end_with, initargs=(os.getpid(),)
     )
-    # a process that ends waits for its children first, and this one would be idle for minutes
+    # an exiting process waits for its children, and this one may idle for minutes
     ended = {"wait": False, "kill_workers": True}
     Finalize(None, executor.shutdown, kwargs=ended, exitpriority=1)
     return executor
 
 
 def end_with(parent: int) -> None:
-    """End this process soon after its parent, since a parent that is killed can't end its workers."""
+    """End this process soon after its parent: a killed parent cannot end its workers."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -142,4 +142,4 @@ def _end_worker() -> None:
 
 
 def nothing() -> None:
-    """Do nothing: the process has imported what it needs by then."""
+    """Do nothing, but import this module in the process."""

@@ -1,1 +1,1 @@
-"""What several estimators share: state, detections, tentative tracks, the driven path, and loop closure."""
+"""Parts that estimators share: state, detections, tentative tracks, the driven path, and loop closure."""

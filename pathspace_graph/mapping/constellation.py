@@ -1,10 +1,10 @@
-"""Constellations: the newest cones, merged and without identity, laid on earlier ones.
+"""Constellations: the newest cones, merged and without identity, are laid on earlier ones.
 
 All pairs of a new and an earlier cone of one label vote for the motion that lays one on the other. The places
-with most votes near the one that odometry claims are refined on a sum of capped squares. The place that costs
-least is sure if nearly all cones that the earlier path would have seen lie on its cones, and no other place
-costs nearly as little. Cones stand at regular distances, so a few of them fit in many places: the others are
-those, the claimed one, where the vehicle may not be back yet, and new road after odometry has failed. A sure
+with most votes near the prediction of odometry are refined on a sum of capped squares. The cheapest place is
+sure if nearly all cones that the earlier path would have seen lie on its cones, and no rival costs nearly as
+little. Cones stand at regular distances, so a few of them fit in many places. Rivals are the other places,
+the prediction itself, where the vehicle may not be back yet, and new road after a failure of odometry. A sure
 place is a relative pose of two cycles, the measurement of every return.
 """
 
@@ -35,28 +35,28 @@ from .detections import DetectionColumns
 from .registration import HEADING, start_crossings
 from .tentative import merged_in_turn
 
-LAID_SIGMA: Final = 0.25  # of a cone's place besides its covariance: slow errors of the sensor (m)
+LAID_SIGMA: Final = 0.25  # standard deviation added to a cone's covariance, for slow errors of the sensor (m)
 LAID_GATE: Final = 9.0  # cap of a cone's square (sigmas^2); beyond it, the cone lies on no other
-CELL: Final = 0.5  # of the votes (m)
-TURN: Final = 0.05  # step of the headings that are tried (rad)
+CELL: Final = 0.5  # cell size of the votes (m)
+TURN: Final = 0.05  # step of the headings (rad)
 LAID_APART: Final = 1.0  # least distance of two different places (m)
-PLACES: Final = 10  # most places of each heading, and a third of the most that are refined
-RANGE: Final = 16.0  # farthest detections that are merged (m)
+PLACES: Final = 10  # largest number of places for each heading, and a third of those refined
+RANGE: Final = 16.0  # largest range of merged detections (m)
 VIEWED: Final = 0.95  # share of the detections within the range and the bearing of a view
-VIEWS: Final = 2.0  # step at which the views along a path are looked at (m)
-LAID_NEWEST: Final = 30.0  # newest path whose cones are laid on earlier ones (m)
-BEYOND: Final = 10.0  # length of the earlier path by which it exceeds the newest on each side (m)
-LAID_CONES: Final = 6  # least number of cones in view that tell a place
-LAID_MISFIT: Final = 2.0  # most mean capped square of these: that of cones that agree, in two dimensions
-UNSEEN: Final = 2.0  # most cost of a cone where nothing was in view: what one that agrees costs on average
-ODOMETRY_FAILED: Final = 20.0  # cost of odometry that has failed: twice the logarithm of the odds against it
+VIEWS: Final = 2.0  # distance of the views along a path (m)
+LAID_NEWEST: Final = 30.0  # length of the newest path whose cones are laid on earlier ones (m)
+BEYOND: Final = 10.0  # length by which the earlier path exceeds the newest on each side (m)
+LAID_CONES: Final = 6  # least number of cones in view for a sure place
+LAID_MISFIT: Final = 2.0  # largest mean capped square of these: the expectation of matching cones in 2D
+UNSEEN: Final = 2.0  # largest cost of a cone out of view: the expectation of a matching one
+ODOMETRY_FAILED: Final = 20.0  # cost of a failure of odometry: twice the log odds against it
 LAID_ODDS: Final = 14.0  # least difference of cost to the next place: odds of a thousand
 LAID_SIGHTINGS: Final = 3  # least number of detections of a cone
-LAP_BEGINNING: Final = 40.0  # length of the beginning of a drive that closes a lap (m)
-LAP_NEWEST: Final = 60.0  # length of the newest path that crosses the start, if a lap is closed (m)
+LAP_BEGINNING: Final = 40.0  # length of the beginning of a drive, on which a lap closes (m)
+LAP_NEWEST: Final = 60.0  # length of the newest path, which crosses the start if a lap closes (m)
 LAP_TURNED: Final = 0.3  # largest error of the heading after a lap (rad)
-SAME_ROAD: Final = 2.5  # largest distance of both passes across their road, by the cones (m)
-SAME_HEADING: Final = 0.5  # largest angle between both passes, by the cones (rad)
+SAME_ROAD: Final = 2.5  # largest distance of two passes of one road, across it (m)
+SAME_HEADING: Final = 0.5  # largest angle between two passes of one road (rad)
 LIMITS: Final = (LAID_SIGMA, LAID_GATE, CELL, TURN, LAID_APART, float(PLACES), UNSEEN, ODOMETRY_FAILED)
 
 
@@ -64,7 +64,7 @@ Cones = tuple[Array, Array, IntArray]
 """Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
 NO_CONES: Final[Cones] = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
 EVERYWHERE: Final[Array] = np.array([[0.0, 0.0, 0.0, inf, inf]])
-"""The view of a constellation that lacks no cone."""
+"""View of a complete constellation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +75,11 @@ class Constellation:
     covariances: Array  # (n, 2, 2) in m^2
     labels: IntArray  # (n,)
     views: Array = field(default_factory=EVERYWHERE.copy)
-    """(k, 5) poses that have looked for cones, with the range (m) and the largest bearing (rad) of a view."""
+    """(k, 5) poses from which cones were detected, with range (m) and largest bearing (rad) of a view."""
 
     @classmethod
     def of(cls, table: DetectionColumns, poses: Array, settings: GrowthSettings) -> Self:
-        """Merge detections, the sharpest first, to cones in the map frame, by the poses (P, 3) of cycles."""
+        """Merge detections, the most certain first, to cones in the map frame, by poses (P, 3) of cycles."""
         point = table.point
         rows = np.flatnonzero((table.label != UNKNOWN) & (np.hypot(*point.T) < RANGE))
         rows = rows[np.argsort(np.trace(table.covariance[rows], axis1=1, axis2=2), kind="stable")]
@@ -100,20 +100,20 @@ class Constellation:
         return self.points, self.covariances, self.labels
 
     def seen_from(self, pose: Array) -> "Constellation":
-        """Return the cones in the frame of a pose (3,)."""
+        """Transform the cones to the frame of a pose (3,)."""
         turned = rotated(self.covariances, np.full(len(self.labels), -pose[2]))
         return Constellation(to_vehicle(self.points, pose[None]), turned, self.labels)
 
 
 @dataclass(frozen=True, eq=False)
 class Laid:
-    """Pose that lays cones, which are in its frame, on earlier ones."""
+    """Pose that lays cones in its frame on earlier ones."""
 
     pose: Array  # (3,) map frame
-    information: Array  # (3, 3) about it, from the cones that lie on others
-    count: int  # number of cones where an earlier one would have been seen
+    information: Array  # (3, 3) of the pose, from the cones that lie on others
+    count: int  # number of cones in view of the earlier path
     misfit: float  # mean capped square of these
-    odds: float  # cost of the next place less that of this one
+    odds: float  # difference of cost to the next place
 
     @property
     def is_sure(self) -> bool:
@@ -124,10 +124,10 @@ class Laid:
 def lay(
     seen: Constellation, known: Constellation, mean: Array, information: Array, reach: tuple[float, float]
 ) -> Laid | None:
-    """Lay cones on known ones, in the frames of a vehicle and of the map; None where they are too few.
+    """Lay cones in the vehicle frame on known ones in the map frame; None if there are too few of them.
 
-    The pose is searched within a `reach` (m, rad) of its `mean` (3,). The square of the difference from the
-    mean, by its `information` (3, 3), counts up to `ODOMETRY_FAILED`.
+    The pose is searched within a `reach` (m, rad) of its `mean` (3,). Its squared Mahalanobis distance from
+    the mean, with `information` (3, 3), counts up to `ODOMETRY_FAILED`.
     """
     if min(len(seen.labels), len(known.labels)) < LAID_CONES:
         return None
@@ -138,27 +138,27 @@ def lay(
 def _best(poses: Array, informations: Array, squares: Array, counts: Array, away: Array, total: int) -> Laid:
     """Return the best of the places of `_kernels:laid`, for a total number of cones.
 
-    A cone where nothing was in view costs as much as one in the next best place of those where enough were in
-    view: rows at regular distances, which fit in many places, say little.
+    A cone out of view costs as much as a cone of the next best place with enough cones in view. So rows at
+    regular distances, which fit in many places, count little.
     """
     misfit = squares / np.maximum(counts, 1.0)
     enough = np.where(counts >= LAID_CONES, misfit, inf)
     _, unseen = _best_and_next(enough, poses, UNSEEN)
     costs = squares + unseen * (total - counts) + np.minimum(away, ODOMETRY_FAILED)
-    best, rival = _best_and_next(costs, poses, ODOMETRY_FAILED + unseen * total)  # which may be new road
+    best, rival = _best_and_next(costs, poses, ODOMETRY_FAILED + unseen * total)  # the limit is new road
     odds = float(rival - costs[best])
     return Laid(poses[best], informations[best], int(counts[best]), float(misfit[best]), odds)
 
 
 def _best_and_next(values: Array, poses: Array, limit: float) -> tuple[int, float]:
-    """Return the pose (of m) with the least value, and the least value of another place, up to a limit."""
+    """Return the index of the least value, and the least value of another place, up to a limit."""
     best = int(values.argmin())
     others = np.hypot(*(poses[:, :2] - poses[best, :2]).T) > LAID_APART
     return best, float(values[others].min(initial=limit))
 
 
 def _views(poses: Array, points: Array) -> Array:
-    """Return views (k, 5) from poses (P, 3), `VIEWS` apart, with the limits of the detections (m, 2)."""
+    """Views (k, 5) from poses (P, 3), `VIEWS` apart, with the limits of the detections (m, 2)."""
     if len(points) == 0:
         return np.zeros((0, 5))
     far, wide = np.quantile(np.abs([np.hypot(*points.T), np.arctan2(*points.T[::-1])]), VIEWED, axis=1)
@@ -172,38 +172,43 @@ SeenIn = Callable[[IntArray], DetectionColumns]
 """The detections of ascending cycles (k,)."""
 
 
+def seen_in(table: DetectionColumns) -> SeenIn:
+    """Return the function that selects detections of a table by cycles."""
+    return lambda cycles: table.where(np.flatnonzero(table.in_cycles(cycles)))
+
+
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """How far from where the poses have it the newest pose may be, beside an earlier pass."""
+    """Prior of the newest pose beside an earlier pass, centred on its estimate."""
 
     radius: float  # largest distance (m)
     turn: float  # largest angle (rad)
-    information: Array  # (3, 3) about the newest pose, map frame
+    information: Array  # (3, 3) of the newest pose, map frame
 
     @classmethod
     def within(cls, radius: float, turn: float, sigmas: tuple[float, float, float]) -> Self:
-        """Expect a pose within standard deviations (m, m, rad)."""
+        """Expect a pose with standard deviations (m, m, rad)."""
         return cls(radius, turn, np.diag(np.array(sigmas) ** -2.0))
 
     @classmethod
     def after(cls, length: float, covariance: Array, closing: ClosingSettings) -> Self:
-        """Expect a pose with a covariance (3, 3) that has drifted for some length (m)."""
+        """Expect a pose with a covariance (3, 3) after drift over a length (m)."""
         information = np.asarray(np.linalg.inv(covariance), np.float64)
         return cls(closing.radius + closing.drift * length, LAP_TURNED, information)
 
 
 NEARBY: Final = Expected.within(4.0, 0.15, (1.0, 1.0, 0.05))
-"""Where laps have been aligned already, or an open road has another one beside it."""
+"""Prior after laps were aligned, or beside another pass of an open road."""
 
 
 def return_to_beginning(
     seen_in: SeenIn, poses: Array, covariance: Array, settings: MapperSettings
 ) -> Revisit | None:
-    """Return the newest pose in the frame of one at the beginning of the drive, if the cones are sure of it.
+    """Return the newest pose in the frame of one at the beginning of the drive, if its place is sure.
 
-    The poses (P, 3) are those of all cycles, and the newest has a covariance (3, 3). The newest path has to
-    cross the line at which the drive began: in each round of a skidpad the vehicle is on its beginning again,
-    but has not closed a lap.
+    `poses` (P, 3) are those of all cycles, and `covariance` (3, 3) is that of the newest. The newest path
+    must cross the start line: in each round of a skidpad the vehicle is on its beginning again, but has not
+    closed a lap.
     """
     stations, closing = path_lengths(poses), settings.closing
     length = float(stations[-1])
@@ -221,10 +226,10 @@ def return_to_beginning(
 def find_return(
     seen_in: SeenIn, poses: Array, last: float, expected: Expected, settings: GrowthSettings
 ) -> tuple[Laid, int] | None:
-    """Lay the newest cones on those of an earlier pass; return how, and the cycle beside which they are.
+    """Lay the newest cones on those of an earlier pass; return the result and the cycle beside it.
 
-    The poses (P, 3) are those of all cycles up to the newest. The earlier pass was over when the path had its
-    `last` length (m). None where there is none, the cones are too few, or they lie beside another road.
+    `poses` (P, 3) are those of all cycles up to the newest. The earlier pass ended at the path length `last`
+    (m). None if there is no pass, the cones are too few, or they lie beside another road.
     """
     earlier, newest = path_lengths(poses) < last, poses[-1]
     alike = earlier & (np.cos(poses[:, 2] - newest[2]) > np.cos(HEADING))
@@ -244,7 +249,7 @@ def find_return(
 def lay_newest(
     seen_in: SeenIn, poses: Array, place: int, expected: Expected, settings: GrowthSettings
 ) -> Laid | None:
-    """Lay the cones of the newest metres on those about an earlier place, by the poses (P, 3) of all."""
+    """Lay the cones of the newest metres on those around an earlier place, given the poses (P, 3) of all."""
     stations = path_lengths(poses)
     first = int(stations.searchsorted(stations[-1] - LAID_NEWEST, side="right"))
     old = np.flatnonzero(np.abs(stations[:first] - stations[place]) < LAID_NEWEST + BEYOND)
@@ -254,9 +259,9 @@ def lay_newest(
 
 
 def revisit_of(laid: Laid, poses: Array, earlier: int, later: int) -> Revisit:
-    """Return the pose of a `later` cycle in the frame of an `earlier` one, where the newest has been laid.
+    """Return the pose of a `later` cycle in the frame of an `earlier` one, given the place of the newest.
 
-    The poses (P, 3) are those of all cycles; from the later cycle to the newest the drive is rigid.
+    `poses` (P, 3) are those of all cycles. The drive is rigid from the later cycle to the newest.
     """
     moved = compose(laid.pose, relative(poses[-1], poses[later]))
     return relative_pose((earlier, poses[earlier]), (later, moved), laid.pose, laid.information)
@@ -265,9 +270,9 @@ def revisit_of(laid: Laid, poses: Array, earlier: int, later: int) -> Revisit:
 def relative_pose(
     earlier: tuple[int, Array], later: tuple[int, Array], centre: Array, information: Array
 ) -> Revisit:
-    """Return the pose of a later cycle in the frame of an earlier one, each a cycle and its pose (3,).
+    """Return the pose of a later cycle in the frame of an earlier one, each given with its pose (3,).
 
-    The information (3, 3) is about a pose at `centre` (3,), in the map frame; the later pose moves with it.
+    `information` (3, 3) is that of a pose at `centre` (3,), map frame, to which the later pose is fixed.
     """
     (first, frame), (last, pose) = earlier, later
     arm, change = pose[:2] - centre[:2], np.eye(3)

@@ -1,4 +1,4 @@
-"""The curves as the engine sees them: rows of detections (paper: Update) and of weak priors, on keys."""
+"""The curves for the engine: rows of detections (paper: Update) and of weak priors, on keys."""
 
 from collections.abc import Callable
 from typing import Final, Self
@@ -18,7 +18,7 @@ from .detections import NO_STATION, DetectionTable
 from .state import State, factor_numbers
 from .stations import SIGMA_POSE, Stations
 
-SIGHTINGS_IN_WINDOW: Final = 20.0  # usual number of a cone's detections in a window
+SIGHTINGS_IN_WINDOW: Final = 20.0  # typical number of a cone's detections in a window
 
 
 class CurveMap:
@@ -29,15 +29,15 @@ class CurveMap:
         self.state = state or State()  # curves and all variables
         self.variables = self.state.variables
         self.detections = DetectionTable()  # detections of the poses in the window
-        self.held_by_prior = False  # whether the prior holds the curves' spacing and shape
+        self.held_by_prior = False  # whether the prior determines the curves' spacing and shape
         self.scatter: dict[int, Array] = {}  # (m,) sigma of cones at each control point, if known (m)
         self.cones: dict[int, Array] = {}  # (k,) parameters of the cones of a closed boundary (m), if known
-        self.stations: Stations | None = None  # these cones, where they hold detections along the curves
+        self.stations: Stations | None = None  # these cones, if they constrain detections along the curves
         self.reached_inactive = False  # whether the latest `rows` reach inactive control points
         self._refined: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
 
     def copy(self) -> Self:
-        """Return a map that can change independently."""
+        """Return an independent copy."""
         other = shallow(self)
         other.state = self.state.copy()
         other.variables = other.state.variables
@@ -47,11 +47,11 @@ class CurveMap:
     # --- detections --------------------------------------------------------------------------------------
 
     def changed(self) -> IntArray:
-        """Return the cycles (k,) whose associations have changed since they were last linearized."""
+        """Cycles (k,) of associations that have changed since the last linearization."""
         return self.detections.cycle[self.detections.changed]
 
     def rows(self, cycles: IntArray) -> list[Rows]:
-        """Return `w_i n_i . (R z_i + t - S(u_i)) / sigma_i` for the detections in use of ascending cycles.
+        """Linearize `w_i n_i . (R z_i + t - S(u_i)) / sigma_i` for the used detections of ascending cycles.
 
         The keys are [pose | control points of the span]; w is the root of the Huber weight, and zero if the
         foot point is not interior. `linearized` stores the refined parameters u.
@@ -75,7 +75,7 @@ class CurveMap:
         return [Rows(*parts), *self._along(rows)]
 
     def _along(self, rows: IntArray) -> list[Rows]:
-        """Return `w t . (R z + t - S(u)) / sigma` for those of the detections (m,) that have a station u."""
+        """Linearize `w t . (R z + t - S(u)) / sigma` for the detections (m,) with a station u."""
         detections, stations = self.detections, self.stations
         rows = rows[detections.station[rows] != NO_STATION]
         if stations is None or len(rows) == 0:
@@ -87,24 +87,25 @@ class CurveMap:
         return [seen.weighted(weights, detections.cycle[rows])]
 
     def sigma_stations(self, station: IntArray) -> Array:
-        """Return the standard deviations (m,) of stations (m,) along their curves, in each detection (m).
+        """Standard deviations (m,) of stations (m,) along their curves, for a single detection (m).
 
-        The error of a station is the same in all of its detections, so each has the variance of all.
+        The error of a station is the same in all of its detections, so each gets its variance times their
+        number.
         """
         assert self.stations is not None
         return np.asarray(SIGHTINGS_IN_WINDOW**0.5 * self.stations.sigma[station])
 
     def correct(self) -> None:
-        """Do nothing: detections are corrected when their points are asked for."""
+        """Do nothing: detections are corrected on access."""
 
     def linearized(self, cycles: IntArray) -> None:
-        """Accept the latest `rows`, of these cycles: the graph holds them from now on."""
+        """Accept the latest `rows`, of these cycles, which the graph has from now on."""
         if len(cycles) and self.state.boundaries:
             self.detections.refine(*self._refined)
             self.detections.mark_linearized()
 
     def activate(self, keys: IntArray) -> None:
-        """Make control points active, which lie next to the active ones."""
+        """Activate control points that are next to the active ones."""
         self.state.activate(keys)
 
     def move(self, motion: Array) -> None:
@@ -116,7 +117,7 @@ class CurveMap:
         self.state.activate_only({})
 
     def drop_cycle(self, cycle: int) -> None:
-        """Remove the detections of a cycle whose pose, the oldest one, has left the window."""
+        """Remove the detections of the oldest pose, which has left the window."""
         self.detections.keep_from(cycle + 1)
         self.state.drop_oldest_pose_u()
 
@@ -127,7 +128,7 @@ class CurveMap:
         stations: dict[int, Array],
         held_by_prior: bool = True,
     ) -> None:
-        """Note that curves and prior are a batch's, with the scatter and the places of cones by label.
+        """Take over the scatter and places of cones, by label, from the batch that made curves and prior.
 
         Stations (2, k) are parameters of cones and their standard deviations along the curves (m), if any.
         """
@@ -138,7 +139,7 @@ class CurveMap:
             self.stations = Stations.of(self.state, u, sigma)
 
     def lay_stations_out(self) -> None:
-        """Lay the stations out anew, since control points are in other rows once an open curve has grown."""
+        """Rebuild the stations: growth of an open curve moves control points to other rows."""
         if self.stations is None:
             return
         u = {curve.label: curve.u for curve in self.stations.curves}
@@ -146,13 +147,13 @@ class CurveMap:
         self.stations = Stations.of(self.state, u, sigma)
 
     def placed_cones(self, label: int) -> Array:
-        """Return the cones (k, 2) that hold detections along a curve: parameters and sigmas along it (m)."""
+        """Stations (k, 2) of a curve: parameters and sigmas along it (m)."""
         curves = self.stations.curves if self.stations is not None else ()
         found = [np.column_stack([curve.u, curve.sigma]) for curve in curves if curve.label == label]
         return np.concatenate([np.zeros((0, 2)), *found])
 
     def forget_cones(self, label: int, is_gone: Callable[[Array], BoolArray]) -> None:
-        """Forget the cones of a closed curve at whose parameters (k,) others stand now."""
+        """Remove the cones of a closed curve that are gone, by their parameters (k,)."""
         placed = {b: self.placed_cones(b) for b in self.state.boundaries}
         placed[label] = placed[label][~is_gone(placed[label][:, 0])]
         places = {b: cones[~is_gone(cones)] if b == label else cones for b, cones in self.cones.items()}
@@ -161,9 +162,9 @@ class CurveMap:
         self.replaced_by(self.scatter, places, stations)
 
     def match(self, rows: IntArray, directions: Array) -> None:
-        """Match detections (m,), newly in use, with the cones of a closed map.
+        """Match newly used detections (m,) with the stations of a closed map.
 
-        They are those on one boundary by unit tangents (m, 2), map frame, at their foot points.
+        directions (m, 2) are the unit tangents at their foot points, map frame.
         """
         if self.stations is None:
             return
@@ -178,11 +179,11 @@ class CurveMap:
 
     @property
     def structure(self) -> object:
-        """Return an object that is replaced when the weak priors hold other control points than before."""
+        """Token whose identity changes with the control points that have weak priors."""
         return self.state.curves.keys if self.state.boundaries else None
 
     def gauge(self, whole: bool) -> list[Rows]:
-        """Return `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`, on all points if `whole`."""
+        """Linearize `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`, on all points if `whole`."""
         if not self.state.boundaries or self.held_by_prior:
             return []
         pairs, nominal, keys, owner = (self.state.whole_curves if whole else self.state.curves).pairs
@@ -192,9 +193,10 @@ class CurveMap:
         return [Rows(keys, jacobian, off / sigma, owner)]
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Return smoothness `D c / (sigma_smoothness spacing)` and anchors, on all points if `whole`.
+        """Rows of smoothness `D c / (sigma_smoothness spacing)` and anchors, on all points if `whole`.
 
-        An anchor holds each control point where it is, so weakly that it only keeps the system regular.
+        An anchor is a prior of a control point at its present position, so weak that it only keeps the system
+        regular.
         """
         smooth, anchors = [], []
         for label, boundary in self.state.boundaries.items():
@@ -209,14 +211,14 @@ class CurveMap:
         return [stacked_rows(groups) for groups in (smooth, anchors) if groups]
 
     def _rows(self, label: int, points: IntArray, jacobian: Array, residual: Array) -> Rows:
-        """Return rows, equally many for each row of `points` (m, k); neighbouring points share an owner."""
+        """Build rows, equally many for each row of `points` (m, k); neighbouring points share an owner."""
         repeated = np.repeat(points, len(residual) // max(len(points), 1), axis=0)
         keys = control_keys(label, self.state.boundaries[label].first + repeated)
         return Rows(keys, jacobian, residual, factor_numbers(repeated[:, 0], label))
 
 
 def _by_axis(coefficients: Array) -> Array:
-    """Return (2 m, 2 k) the coefficients (m, k) of k points, once for x and once for y."""
+    """Expand coefficients (m, k) of k points to (2 m, 2 k), once for x and once for y."""
     both = np.zeros((len(coefficients), 2, coefficients.shape[1], 2))
     both[:, 0, :, 0] = both[:, 1, :, 1] = coefficients
     return both.reshape(2 * len(coefficients), 2 * coefficients.shape[1])

@@ -1,4 +1,4 @@
-"""The model of a detection, for the window and the batch: rows across a curve, and along it at a station."""
+"""The model of a detection, for window and batch: rows across a curve, and along it at a station."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -18,25 +18,25 @@ from .state import State
 
 @dataclass(frozen=True, eq=False)
 class DetectionRows:
-    """A row for each of m detections on [pose | sensor | control points], not whitened."""
+    """One row for each of m detections on [pose | sensor | control points], not whitened."""
 
-    rows: IntArray  # (m,) detections, by row of their table
+    rows: IntArray  # (m,) detections, by row of the table
     keys: IntArray  # (m, k)
     residual: Array  # (m,) distance from the curve or from the station, in m
-    sigma: Array  # (m,) its standard deviation in m; infinite where it says nothing
+    sigma: Array  # (m,) its standard deviation in m; infinite for a detection without information
     jacobian: Array  # (m, n)
 
     @property
     def whitened(self) -> Array:
-        """Return the residuals (m,) in sigmas."""
+        """Residuals (m,) in sigmas."""
         return np.asarray(self.residual / self.sigma)
 
     def scale(self, weights: Array) -> Array:
-        """Return the factor (m,) that whitens each row and gives it a robust weight (m,), in 1/m."""
+        """Factors (m,) that whiten the rows and apply robust weights (m,), in 1/m."""
         return np.asarray(np.sqrt(weights) / self.sigma)
 
     def weighted(self, weights: Array, owner: IntArray) -> Rows:
-        """Return whitened rows with robust weights (m,); each is part of the factor `owner` (m,)."""
+        """Whiten the rows and apply robust weights (m,); each row is part of the factor `owner` (m,)."""
         scale = self.scale(weights)
         return Rows(self.keys, self.jacobian * scale[:, None], self.residual * scale, owner)
 
@@ -54,9 +54,9 @@ def rows_across(
     foot: FootPoints,
     sigma_model: float,
 ) -> DetectionRows:
-    """Return `n . (R z + t - S(u))` of detections (m,) at points (m, 2), map frame.
+    """Linearize `n . (R z + t - S(u))` for detections (m,) at points (m, 2), map frame.
 
-    The foot points are on `State.curves`, and the terms those of `factors._kernels:detection_rows`.
+    Foot points are on `State.curves`. The terms are those of `factors._kernels:detection_rows`.
     """
     cycle, variables = detections.cycle[rows], state.variables
     measuring = measuring_keys(cycle, variables, state.drives)
@@ -81,7 +81,7 @@ def rows_across(
 
 
 def measuring_keys(cycle: IntArray, variables: Variables, drives: Drives) -> IntArray:
-    """Return the keys (m, 1) of the poses of cycles (m,), or (m, 2) with the sensor's calibration."""
+    """Keys (m, 1) of the poses of cycles (m,), or (m, 2) with the sensor's calibration."""
     sensors = np.asarray(drives.sensors)[drives.of(cycle)]
     keys = np.column_stack([FIRST_POSE + cycle, SENSOR_KEY + sensors])
     return np.asarray(keys[:, : 2 if len(variables.sensor) else 1])

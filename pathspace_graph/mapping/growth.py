@@ -1,4 +1,4 @@
-"""Growth of the open curves through confirmed tentative tracks ahead of their ends (paper: Expansion)."""
+"""Growth of open curves through confirmed tentative tracks ahead of their ends (paper: Expansion)."""
 
 from collections.abc import Mapping
 from statistics import median
@@ -20,11 +20,11 @@ from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nea
 from pathspace_graph.settings.online import GrowthSettings
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
-NEWEST: Final = 3  # newest cones that, with the end of a curve, say how far it runs beside the path
-RECALL: Final = 25.0  # newest stretch of path and curves (m): in a second round, the first tells nothing
-NEARER: Final = 0.5  # how much nearer the path must come to pass a passed cone again (m)
-LENGTH_FREE: Final = 50.0  # length of an open curve that is allowed whatever the path driven (m)
-LENGTH_DRIVEN: Final = 2.0  # further length for each metre driven, exceeded by zigzags between false cones
+NEWEST: Final = 3  # number of newest cones that determine, with its end, a curve's distance from the path
+RECALL: Final = 25.0  # newest stretch of path and curves that counts (m): in a second round, not the first
+NEARER: Final = 0.5  # least decrease of the distance at which the path passes a cone again (m)
+LENGTH_FREE: Final = 50.0  # length of an open curve that is always allowed (m)
+LENGTH_DRIVEN: Final = 2.0  # further length for each metre driven; zigzags between false cones exceed it
 
 
 class Growth:
@@ -38,7 +38,7 @@ class Growth:
         self._beside = dict.fromkeys(BOUNDARIES, np.zeros((0, 2)))
 
     def copy(self) -> Self:
-        """Return tracks that can go on independently."""
+        """Return an independent copy."""
         other = shallow(self)
         other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
         other._beside = self._beside.copy()
@@ -69,7 +69,7 @@ class Growth:
         return frozenset(grown), joined(_stopped(smoother.map, label) for label in stopped)
 
     def wait_for(self, ends: Mapping[int, float]) -> None:
-        """Let known curves grow only once the vehicle is at their ends (m), by label."""
+        """Let known curves grow only when the vehicle is near their ends (m), by label."""
         self._known = ends
 
     def move(self, motion: Array) -> None:
@@ -81,7 +81,7 @@ class Growth:
             tracks.clear()
 
     def _waits(self, state: State, label: int) -> bool:
-        """Return whether the vehicle is far from the end of a known curve."""
+        """Whether the vehicle is far from the end of a known curve."""
         at_end = self._known.get(label, -np.inf) - self.settings.reach
         return bool(state.pose_u[label][-1] < at_end)
 
@@ -98,7 +98,7 @@ class Growth:
         _relocate_poses(state, label, 0.0)
 
     def _grow(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> bool:
-        """Extend a curve, after it is taken back if its cones are out of order; True if it has changed."""
+        """Extend a curve; first take it back if its cones are out of order. Return whether it has changed."""
         track, boundary = smoother.map, smoother.map.state.boundaries[label]
         kept, self._beside[label] = check_order(boundary, path_ahead, self._beside[label])
         if kept == len(boundary.observed):
@@ -110,7 +110,7 @@ class Growth:
         return True
 
     def _extend(self, track: CurveMap, label: int, path_ahead: PathAhead, behind: float) -> bool:
-        """Extend a curve through all candidates, or carry on a stranded end; True if it has grown.
+        """Extend a curve through all candidates, or extrapolate a stranded end; return whether it has grown.
 
         The end is located on the path from `behind` (m) behind the vehicle on.
         """
@@ -126,7 +126,7 @@ class Growth:
         return False
 
     def _follow_path(self, state: State, label: int, path_ahead: PathAhead, end: End, room: float) -> bool:
-        """Extrapolate an end that was passed, at its distance from the path; True if the curve has grown."""
+        """Extrapolate a passed end, at its distance from the path; return whether the curve has grown."""
         side = max(end.side, path.MIN_LATERAL)
         point = path_ahead.beside(path_ahead.driven - path.CARRIED_TO, SIDES[label] * side)
         distance = float(np.hypot(*(point - end.position)))
@@ -138,7 +138,7 @@ class Growth:
         return True
 
     def _take_back(self, smoother: CurveSmoother, label: int, kept: int) -> None:
-        """Shorten a curve to its first `kept` cones; the other cones are tentative tracks again."""
+        """Shorten a curve to its first `kept` cones; the others become tentative tracks again."""
         state, detections = smoother.map.state, smoother.map.detections
         boundary = state.boundaries[label]
         self.tentative[label].restore(boundary.observed[kept:], smoother.times[-1])
@@ -148,7 +148,7 @@ class Growth:
         detections.release(rows[detections.u[rows] > boundary.trusted])
 
     def _consume(self, track: CurveMap, label: int, found: Candidates, u: Array) -> None:
-        """Make candidates part of the curve at u (k,), and put the window's detections of them into use."""
+        """Make candidates part of the curve at u (k,), and use the window's detections of them."""
         detections, boundary = track.detections, track.state.boundaries[label]
         boundary.add_cones(found.points, u)
         self.tentative[label].remove(found.indices)
@@ -188,10 +188,10 @@ class Growth:
         return found if end is None else found.where(_uncrossed(track.state, label, path_ahead, end, found))
 
     def _certain(self, label: int, path_ahead: PathAhead, found: Candidates) -> IntArray:
-        """Return the candidates, by index, up to the first one ahead that is not known well enough.
+        """Select candidates, by index, up to the first uncertain one ahead.
 
-        In a hairpin, the row of the way back may be known before the next cone of the way there. A candidate
-        that was passed is left out.
+        In a hairpin, the row of the way back may be known before the next cone of the way there. Uncertain
+        candidates that were passed are skipped.
         """
         known = self.tentative[label].sigmas(found.indices) < self.settings.sigma
         waiting = np.flatnonzero(~known & (found.stations > path_ahead.driven))
@@ -219,7 +219,7 @@ def _extend_through(state: State, label: int, end: Array, points: Array) -> Arra
 
 
 def _relocate_poses(state: State, label: int, from_u: float) -> None:
-    """Find the poses' parameters again on a curve that was changed from `from_u` on."""
+    """Find the poses' parameters again on a curve that has changed from `from_u` on."""
     boundary, pose_u = state.boundaries[label], state.pose_u[label].copy()
     late = pose_u >= from_u
     poses = state.poses[late, :2]
@@ -229,10 +229,10 @@ def _relocate_poses(state: State, label: int, from_u: float) -> None:
 
 
 def _uncrossed(state: State, label: int, path_ahead: PathAhead, end: End, found: Candidates) -> IntArray:
-    """Return the candidates, by index, up to the first that is reached only across a line.
+    """Select candidates, by index, up to the first one that lies across a line.
 
-    Lines are the newest stretches of the path driven and of both boundaries, which in a second lap of an
-    open loop run along their first ones.
+    Lines are the newest stretches of the driven path and of both boundaries. Older stretches do not count,
+    since a second lap of an open loop runs along the first one.
     """
     way = newest(path_ahead, end.station)
     lines = [way.points[way.stations <= way.driven]]
@@ -251,7 +251,7 @@ def _uncrossed(state: State, label: int, path_ahead: PathAhead, end: End, found:
 def end_of(state: State, label: int, path_ahead: PathAhead, behind: float) -> End:
     """Return the confirmed end of a curve, located on the path from `behind` (m) behind the vehicle on.
 
-    Its distance from the path is the median with the newest cones', so that one wrong cone leads nowhere.
+    Its distance from the path is the median over end and newest cones, which is robust to one wrong cone.
     """
     boundary = state.boundaries[label]
     u = np.array([boundary.confirmed_end])
@@ -265,7 +265,7 @@ def end_of(state: State, label: int, path_ahead: PathAhead, behind: float) -> En
 
 
 def _stopped(track: CurveMap, label: int) -> Text:
-    """Return the notice of a boundary that has just stopped growing."""
+    """Notice of a boundary that has just stopped growing."""
     boundary = track.state.boundaries[label]
     return Text(
         "the open {name} boundary grows no further, with {size} control points on {length:.3g} m",
@@ -276,10 +276,10 @@ def _stopped(track: CurveMap, label: int) -> Text:
 
 
 def undisputed(track: CurveMap, label: int, points: Array, radius: float) -> BoolArray:
-    """Return whether places (n, 2) have at least as many detections of `label` within `radius` (m) as others.
+    """Whether places (n, 2) have at least as many detections of `label` within `radius` (m) as others.
 
-    A sensor that now and then confuses colours sees the true one more often. All coloured detections of the
-    window count, in use or not.
+    A sensor that sometimes confuses colours detects the true one more often. All coloured detections of the
+    window count, used or not.
     """
     detections = track.detections
     rows = np.flatnonzero(detections.label != UNKNOWN)
@@ -290,12 +290,13 @@ def undisputed(track: CurveMap, label: int, points: Array, radius: float) -> Boo
 
 
 def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tuple[int, Array]:
-    """Return how many of a curve's cones, from its first on, are in the order in which they were passed.
+    """Count the cones of a curve, from its first on, that are in the order in which they were passed.
 
     The order of cones ahead is predicted with an arc. In a hairpin, the row of the way back may be nearer
-    than that of the way there, so the order is certain only once they were passed. The last `RECALL` metres
-    of the curve are checked, whose first cone counts as in order. `known` (n, 2) are station and distance
-    beside the path of the first n cones in the cycle before, and the second result (m, 2) those of now.
+    than the row of the way there, so the order is certain only after they were passed. The last `RECALL`
+    metres of the curve are checked; their first cone counts as in order. `known` (n, 2) are station and
+    distance beside the path of the first n cones in the last cycle, and the second result (m, 2) the new
+    ones.
     """
     first = int(boundary.cone_parameters.searchsorted(boundary.confirmed_end - RECALL))
     beside = np.full((len(boundary.observed), 2), np.nan)  # nothing is known of others
@@ -313,5 +314,5 @@ def check_order(boundary: Boundary, path_ahead: PathAhead, known: Array) -> tupl
 
 
 def newest(path_ahead: PathAhead, station: float = np.inf) -> PathAhead:
-    """Return the path without earlier rounds: from `RECALL` before the vehicle, or before a station (m)."""
+    """Cut earlier rounds off the path: it begins `RECALL` before the vehicle, or before a station (m)."""
     return path_ahead.since(min(station, path_ahead.driven) - RECALL)

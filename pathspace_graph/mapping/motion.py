@@ -1,4 +1,4 @@
-"""The motion between two perception cycles, the prediction by it (paper: Predict), and its calibration."""
+"""The motion between two perception cycles, prediction (paper: Predict), and calibration."""
 
 from dataclasses import dataclass, field, replace
 from math import inf
@@ -21,14 +21,13 @@ from pathspace_graph.settings.online import OdometrySettings
 
 from .path import DrivenPath
 
-DOUBT_CYCLES: Final = 10  # cycles from one judgement of all calibrations to the next
-KEYFRAME_INTERVAL: Final = 12.0
-"""Distance of the keyframes in whose frames the drive is kept until the loop closes (m along the path)."""
+DOUBT_CYCLES: Final = 10  # cycles between two checks of the calibrations
+KEYFRAME_INTERVAL: Final = 12.0  # distance of the keyframes of the open drive (m along the path)
 
 
 @dataclass(frozen=True)
 class BiasMeasurement:
-    """A measured bias of the yaw rate: what a vehicle at rest measures."""
+    """Bias of the yaw rate, measured by a vehicle at rest."""
 
     value: float  # mean yaw rate (rad/s)
     sigma: float  # its standard deviation (rad/s)
@@ -36,20 +35,20 @@ class BiasMeasurement:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMotion:
-    """The motion that leads to a cycle, and what was found out about the odometry."""
+    """The motion since the last cycle, and the findings of the check of odometry."""
 
     odometry: IntegratedOdometry  # relative pose, with its covariance
     twists: Array  # (k, 3) twists since the last cycle, in m/s, m/s and rad/s
-    doubted: bool = False  # whether the detections contradict the odometry, and their own motion replaces it
-    missing: bool = False  # whether no twist was measured for long
-    stuck: bool = False  # whether the twist stays the same to the last digit
-    bias: BiasMeasurement | None = None  # what the vehicle has measured at rest, where it has just done so
-    durations: Array | None = None  # (k,) times for which the twists hold (s); None if not the odometry's
+    doubted: bool = False  # whether the detections contradict the odometry; their own motion replaces it
+    missing: bool = False  # whether twists were missing for too long
+    stuck: bool = False  # whether the twist repeats to the last digit
+    bias: BiasMeasurement | None = None  # bias, if just measured at rest
+    durations: Array | None = None  # (k,) durations of the twists (s); None if they are not the odometry's
     excess: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,) or (k, 3) Standard deviation of a twist that is held for long, beside that of its noise."""
+    """(3,) or (k, 3) Additional standard deviation of a twist that is extrapolated for long."""
 
     def with_sigma(self, sigma: Array) -> Self:
-        """Return the motion by other standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
+        """Integrate the motion again with other standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
         if self.durations is None:
             return self
         integrated = integrate_twists(self.durations, self.twists, np.hypot(sigma, self.excess))
@@ -61,17 +60,17 @@ class MeasuredMotion:
 
     @property
     def fault(self) -> str:
-        """Return what is wrong with the odometry in plain words; it is empty where nothing is."""
+        """Fault of the odometry in words; empty if there is none."""
         if self.missing:
             return "there is no odometry"
         return "the detections contradict the odometry" if self.doubted else ""
 
 
 def known_noise(sigma: Array | KnownNoise | None, scale: float = 1.0) -> KnownNoise:
-    """Return what is known of the noise before a drive, at scale 1; by default the simulator's, not stated.
+    """Noise as known before a drive, at scale 1; by default the simulator's, not stated.
 
-    What is given is in metres of a scene of the scale. An array (3,) states the standard deviations of a
-    twist (m/s, m/s, rad/s). SettingsError is raised for anything but three positive numbers.
+    `sigma` is in metres of a scene of the given scale. An array (3,) states the standard deviations of a
+    twist (m/s, m/s, rad/s). SettingsError for anything but three positive numbers.
     """
     if sigma is None:
         return KnownNoise(np.array(ODOMETRY_SIGMA), odometry_stated=False)
@@ -81,7 +80,7 @@ def known_noise(sigma: Array | KnownNoise | None, scale: float = 1.0) -> KnownNo
 
 
 def _positive_sigmas(values: Any) -> Array:
-    """Return the standard deviations (3,) of a twist; SettingsError for anything but positive numbers."""
+    """Convert to the standard deviations (3,) of a twist; SettingsError for anything but positive numbers."""
     try:
         sigmas = np.array(values, float)
     except (TypeError, ValueError):
@@ -93,7 +92,7 @@ def _positive_sigmas(values: Any) -> Array:
 
 
 def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:
-    """Integrate twists, each held until the next and the last one until a stamp (s).
+    """Integrate twists, each constant until the next one, and the last one until a stamp (s).
 
     sigma, (3,) or (k, 3), is the standard deviation of one measured twist (m/s, m/s, rad/s).
     """
@@ -109,11 +108,11 @@ def predict(smoother: FixedLagSmoother[MapRows], path: DrivenPath, motion: Measu
 
 
 def with_inflated_priors(mean: Array, variance: Array, settings: MapperSettings) -> MapperSettings:
-    """Return the settings, with wide priors of the calibrations if the drive contradicts one of them.
+    """Widen the priors of the calibrations if the drive contradicts one of them; return the settings.
 
-    mean m and variance v, (2,) or (7,), are those of the calibrations. If a prior with mean p and standard
-    deviation sigma is right, then m - p had the variance `sigma^2 - v` before the drive. Those contradicted
-    most become wide, of the odometry or of the sensor: a heavy tail, as of a mixture of two Gaussians.
+    mean m and variance v, (2,) or (7,), are the estimates of the calibrations. If a prior with mean p and
+    standard deviation sigma is right, m - p has the variance `sigma^2 - v`. The group with the most
+    contradicted entry becomes wide, odometry or sensor. This acts like a heavy-tailed prior.
     """
     sigma = np.array(settings.sigmas_calibrations)
     limits = np.full(len(sigma), settings.calibration.doubt)
@@ -121,7 +120,7 @@ def with_inflated_priors(mean: Array, variance: Array, settings: MapperSettings)
     if settings.odometry.hold_scale:
         limits[0] = np.inf
     spread = sigma**2 - variance
-    shown = spread > np.finfo(np.float32).eps * sigma**2  # the drive says something at all
+    shown = spread > np.finfo(np.float32).eps * sigma**2  # whether the drive is informative
     off = mean - settings.calibrations
     square = np.where(shown, off**2 / np.where(shown, spread, 1.0), 0.0) / limits**2
     most = int(np.argmax(square))
@@ -138,18 +137,20 @@ def inflate_priors(
     sensor_doubted: bool,
     measured: MapperSettings | None = None,
 ) -> MapperSettings:
-    """Widen the priors of calibrations that the drive contradicts, and return the settings with the new ones.
+    """Widen the priors of calibrations that the drive contradicts; return the settings with the new priors.
 
-    Where the front end doubts the prior of the sensor, it becomes wide at once, before other variables have
-    absorbed the sensor's errors. Where it has measured these, the priors are those of the settings
-    `measured`. It is for an open loop: the prior of a closed one is linearized where the calibration was
-    then, and is overconfident.
+    If the front end doubts the prior of the sensor, it becomes wide at once, before other variables absorb
+    the sensor's errors. If it has measured these errors, the priors come from the settings `measured`. Call
+    it on an open loop only: the prior of a closed map is linearized at the calibration of its closure, and is
+    overconfident.
     """
     if measured is not None:
         settings = replace(settings, odometry=measured.odometry, calibration=measured.calibration)
     if sensor_doubted and settings.calibration.doubt < inf:
         settings = replace(settings, calibration=settings.calibration.widened())
-    is_due = measured is None and smoother.next_cycle % DOUBT_CYCLES == 0  # else old priors made the estimate
+    is_due = (
+        measured is None and smoother.next_cycle % DOUBT_CYCLES == 0
+    )  # else the estimate lacks the new priors
     if smoother.last_step is not None and is_due:
         variables = smoother.variables
         variance = np.diag(smoother.last_covariance(variables.calibration_keys))
@@ -159,17 +160,18 @@ def inflate_priors(
 
 
 def with_size(covariance: Array, values: Array, sigma: float) -> Array:
-    """Return a covariance (n, n) with that of the size of the world added: `sigma^2 v v'`.
+    """Add the uncertainty of the scale of the world to a covariance (n, n): `sigma^2 v v'`.
 
-    The values v (n,) are lengths from where the drive began (m), and zero for headings. Where a scale is held
-    no measurement tells the size, so it changes all lengths alike.
+    The values v (n,) are lengths from the start (m), and zero for headings. A fixed scale error of the
+    odometry is not measured, and changes all lengths alike.
     """
     return covariance + sigma**2 * np.outer(values, values)
 
 
-def size_of_vehicle(pose: Array, count: int) -> Array:
-    """Return the values of `with_size` (n,) of [pose | calibrations], of which the first is a scale."""
-    return np.concatenate([pose[:2], [0.0, -1.0], np.zeros(count - 1)])
+def vehicle_of(pose: Array, calibrations: Array, covariance: Array, sigma_size: float) -> VehicleState:
+    """Return the vehicle's state, given the covariance of [pose | calibrations] without that of the scale."""
+    values = np.concatenate([pose[:2], [0.0, -1.0], np.zeros(len(calibrations) - 1)])  # -1 by the scale error
+    return VehicleState.split(pose, calibrations, with_size(covariance, values, sigma_size))
 
 
 def vehicle_state(smoother: FixedLagSmoother[MapRows], sigma_size: float = 0.0) -> VehicleState:
@@ -178,13 +180,11 @@ def vehicle_state(smoother: FixedLagSmoother[MapRows], sigma_size: float = 0.0) 
     if len(variables.sensor):
         keys.append(SENSOR_KEY)
     covariance = smoother.covariance(np.array(keys, np.intp))
-    pose = variables.poses[-1]
-    covariance = with_size(covariance, size_of_vehicle(pose, len(variables.calibrations)), sigma_size)
-    return VehicleState.split(pose, variables.calibrations, covariance)
+    return vehicle_of(variables.poses[-1], variables.calibrations, covariance, sigma_size)
 
 
 def smoother_settings(settings: MapperSettings) -> SmootherSettings:
-    """Return the engine's part of an estimator's settings."""
+    """Select the engine's part of an estimator's settings."""
     return SmootherSettings(
         lag=settings.lag,
         max_poses=settings.max_poses,

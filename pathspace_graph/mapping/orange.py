@@ -1,4 +1,4 @@
-"""Orange cones: points of the map, which bound no road."""
+"""Orange cones: points of the map that belong to no boundary."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -19,11 +19,11 @@ from pathspace_graph.settings.online import GrowthSettings
 
 from .tentative import TentativeTracks
 
-PASS_RADIUS: Final = 0.4  # radius of the tracks of a pass by the merge radius: a gate has pairs
-STAYING: Final = 0.05  # share of a detection's variance that stays with a cone, however often it is seen
-SAME_CHI: Final = 2.5  # distance up to which two tracks of a pass are one cone, in sigmas of both together
-SELDOM: Final = 0.4  # share of the cycles with one of two tracks, below which they were met alone
-PLACE: Final = 3.0  # distance from a cone within which only its own pass tells where others stand (m)
+PASS_RADIUS: Final = 0.4  # radius of the tracks of a pass, as a share of the merge radius: gates have pairs
+STAYING: Final = 0.05  # share of a detection's variance that no number of detections averages out
+SAME_CHI: Final = 2.5  # largest distance of two tracks of one cone, in sigmas of both together
+SELDOM: Final = 0.4  # share of common cycles below which two tracks count as detected alone
+PLACE: Final = 3.0  # distance around a cone in which only the best pass places cones (m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,38 +36,38 @@ class Sighting:
     detections: Detections  # detections of orange cones only
 
     def placed_by(self, known: Sequence[tuple[int, Array]]) -> Self:
-        """Return the sighting with its pose among poses (P, 3), each from a first cycle on; the last wins."""
+        """Take the pose from arrays of poses (P, 3), each with its first cycle; the last one wins."""
         poses = [poses[self.cycle - first] for first, poses in known if 0 <= self.cycle - first < len(poses)]
         return replace(self, pose=poses[-1].copy()) if poses else self
 
 
 class OrangeCones:
-    """Orange cones as points of the map; they bound no road, and do not hold the vehicle.
+    """Orange cones as points of the map. They belong to no boundary and do not constrain the vehicle pose.
 
-    Each pass has tracks of its own, since the vehicle's place drifts from one to the next. Tracks of one cone
-    are merged after the pass; at each place, the pass with most detections says which cones stand there.
+    Each pass has tracks of its own, since the vehicle pose drifts between passes. Tracks of one cone are
+    merged after the pass. At each place, the pass with most detections determines the cones.
     """
 
-    MOST: Final = 500  # newest cycles that are remembered, to be placed again when poses are corrected
+    MOST: Final = 500  # number of stored cycles, which are placed again when poses are corrected
 
     def __init__(self, settings: GrowthSettings, sigma: float) -> None:
-        """Keep how detections are merged, and a standard deviation (m) that none of them averages out."""
+        """Take the settings of merging, and a standard deviation (m) that is added to every cone."""
         self._settings, self._sigma = settings, sigma
         self._sightings: tuple[Sighting, ...] = ()
         self._passes: dict[int, tuple[_Pass, ...]] = {}  # by label, in order
 
     def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
+        """Return an independent copy; no attribute is changed in place."""
         return shallow(self)
 
     def add(self, sighting: Sighting, sensor: Array) -> None:
-        """Add the detections of a cycle; `sensor` is the calibration (5,) of the sensor, or (0,)."""
+        """Add the detections of a cycle; `sensor` is the calibration of the sensor, (5,) or (0,)."""
         if len(sighting.detections.labels):
             self._sightings = (*self._sightings[1 - self.MOST :], sighting)
             self._place(sighting, sensor)
 
     def place_again(self, sensor: Array, *known: tuple[int, Array]) -> None:
-        """Place all detections anew by poses (P, 3), each from a first cycle on; later arguments win."""
+        """Place all detections again by arrays of poses (P, 3), each with its first cycle; the last wins."""
         self._passes = {}
         self._sightings = tuple(one.placed_by(known) for one in self._sightings)
         for one in self._sightings:
@@ -101,7 +101,7 @@ class OrangeCones:
             self._passes = {**self._passes, label: (*earlier, present)}
 
     def _passes_at(self, label: int, t: float) -> tuple["_Pass", ...]:
-        """Return the passes with the present one, which begins where no cone was seen for a while."""
+        """Return the passes up to the present one, which is new if no cone was seen for a while."""
         passes, settings = self._passes.get(label, ()), self._settings
         if passes and t - passes[-1].tracks.last_t.max() <= settings.forget_after:
             return passes
@@ -111,14 +111,14 @@ class OrangeCones:
 
 @dataclass(frozen=True, eq=False)
 class _Pass:
-    """Tracks of one label in one pass, which stay as they are."""
+    """Tracks of one label in one pass; immutable."""
 
     tracks: TentativeTracks
     together: IntArray = field(default_factory=lambda: np.zeros((0, 0), np.intp))
-    """(n, n) Number of cycles in which each two of them were detected together."""
+    """(n, n) Number of cycles in which two tracks were detected together."""
 
     def with_detections(self, points: Array, covariances: Array, t: float) -> "_Pass":
-        """Return the pass with detections (m, 2), seen at t (s), and their covariances (m, 2, 2)."""
+        """Add detections (m, 2) with covariances (m, 2, 2), seen at t (s)."""
         tracks = self.tracks.copy()
         tracks.add(points, covariances, t)
         new, seen = len(tracks.last_t) - len(self.together), tracks.last_t == t
@@ -130,7 +130,7 @@ class _Pass:
         return replace(self, tracks=tracks)
 
     def cones(self) -> list["_Cone"]:
-        """Return the confirmed tracks, merged while two of them may be one cone."""
+        """Confirmed tracks, merged while two of them may be one cone."""
         tracks, known = self.tracks, self.tracks.confirmed()
         rows = zip(
             tracks.points[known], tracks.information[known], tracks.counts[known].tolist(), strict=True
@@ -150,7 +150,7 @@ class _Pass:
 
 
 def _alone(together: IntArray, a: int, b: int) -> bool:
-    """Return whether two tracks were hardly ever detected in one cycle, as two cones would be."""
+    """Whether two tracks were seldom detected in one cycle, unlike two cones."""
     return bool(together[a, b] < SELDOM * min(together[a, a], together[b, b]))
 
 
@@ -162,16 +162,16 @@ class _Cone:
 
     @property
     def single(self) -> Array:
-        """Return the covariance (2, 2) of one detection (m^2)."""
+        """Covariance (2, 2) of one detection (m^2)."""
         return np.asarray(self.count * np.linalg.inv(self.information), np.float64)
 
     @property
     def covariance(self) -> Array:
-        """Return the covariance (2, 2) of the place (m^2); a part of each detection's error stays in it."""
+        """Covariance (2, 2) of the place (m^2), in which a part of each detection's error remains."""
         return (1.0 / self.count + STAYING) * self.single
 
     def apart(self, other: "_Cone", alone: bool) -> float:
-        """Return the squared distance of two tracks in sigmas: of one detection where they were met alone."""
+        """Squared distance of two tracks in sigmas; `alone`, in sigmas of a single detection."""
         off = self.place - other.place
         joint = self.single + other.single if alone else self.covariance + other.covariance
         return float(off @ np.linalg.solve(joint, off))
@@ -184,7 +184,7 @@ class _Cone:
 
 
 def _best(passes: Sequence[Sequence[_Cone]], sigma: float) -> list[_Cone]:
-    """Return the cones that are known to `sigma` (m), at each place those of the best pass."""
+    """Return the cones known to `sigma` (m), at each place from the pass with most detections."""
     found: list[_Cone] = []
     for cones in sorted(passes, key=lambda cones: -sum(cone.count for cone in cones)):
         before = np.array([cone.place for cone in found]).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""The driven path and the path ahead, along which curves grow, and the cones that come next beside it."""
+"""The driven path and the path ahead, along which curves grow, and the next cones beside it."""
 
 from dataclasses import dataclass
 from typing import Final, Self
@@ -14,9 +14,9 @@ from pathspace_graph.labels import LEFT, RIGHT
 STEP: Final = 0.3  # least distance of neighbouring positions of the stored path (m)
 PATH_MEMORY: Final = 60.0  # length of the stored path behind the vehicle, and of the stored first stretch (m)
 BEGINNING_STEP: Final = 1.0  # least distance of neighbouring poses of the stored first stretch (m)
-MAX_CURVATURE: Final = 0.3  # largest curvature of the predicted path (1/m): that of a tight hairpin
-CURVATURE_GAIN: Final = 0.4  # share of a cycle's measured curvature in the smoothed one
-MIN_SPEED: Final = 1.0  # speed (m/s) below which yaw rate over speed is too uncertain to be a curvature
+MAX_CURVATURE: Final = 0.3  # largest curvature of the predicted path (1/m), of a tight hairpin
+CURVATURE_GAIN: Final = 0.4  # weight of a cycle's measured curvature in the smoothed one
+MIN_SPEED: Final = 1.0  # least speed (m/s) for a curvature from yaw rate over speed
 SIDES: Final = {LEFT: 1.0, RIGHT: -1.0}  # sign of the distance from the path of each boundary
 
 
@@ -29,16 +29,16 @@ class PathAhead:
     driven: float  # station of the vehicle (m)
 
     def locate(self, points: Array) -> tuple[Array, Array]:
-        """Return the stations (m,) and the signed distances (m,), left positive, of points (m, 2)."""
+        """Return stations (m,) and signed distances (m,), left positive, of points (m, 2)."""
         return along_and_across(points, self.points, self.stations)
 
     def since(self, station: float) -> Self:
-        """Return the path from the last position before a station (m) on."""
+        """Cut off the path before the last position ahead of a station (m)."""
         first = max(int(self.stations.searchsorted(station)) - 1, 0)
         return type(self)(self.points[first:], self.stations[first:], self.driven)
 
     def beside(self, station: float, lateral: float) -> Array:
-        """Return the point (2,) near a station (m), at a signed distance (m) to the left of the path."""
+        """Point (2,) near a station (m), at a signed distance (m) to the left of the path."""
         i = int(np.clip(np.searchsorted(self.stations, station), 1, len(self.stations) - 1))
         direction = self.points[i] - self.points[i - 1]
         direction /= max(np.hypot(*direction), np.finfo(float).tiny)
@@ -49,15 +49,15 @@ class DrivenPath:
     """A polyline that grows with the vehicle, and the curvature of its present turn."""
 
     def __init__(self) -> None:
-        self.points: Array = np.zeros((0, 2))  # (n, 2) kept positions in m, map frame, at least `STEP` apart
+        self.points: Array = np.zeros((0, 2))  # (n, 2) positions in m, map frame, at least `STEP` apart
         self.stations: Array = np.zeros(0)  # (n,) path length up to each of them (m)
         self.beginning: Array = np.zeros((0, 3))  # (k, 3) poses (x, y, theta) on the first stretch
-        self.length = 0.0  # length of the driven path: the station of the vehicle (m)
+        self.length = 0.0  # length of the driven path, the station of the vehicle (m)
         self.curvature = 0.0  # smoothed curvature of the present turn (1/m), left positive
         self._last: Array = np.zeros(2)
 
     def copy(self) -> Self:
-        """Return a path that can grow independently; its arrays are only replaced."""
+        """Return an independent copy; arrays are only replaced."""
         return shallow(self)
 
     def update(self, pose: Array) -> None:
@@ -79,12 +79,12 @@ class DrivenPath:
             self.points, self.stations = self.points[keep], self.stations[keep]
 
     def move(self, motion: Array) -> None:
-        """Move the path behind the vehicle by a rigid motion (3,) of the map frame; its beginning stays."""
+        """Move the path behind the vehicle by a rigid motion (3,) of the map frame, except its beginning."""
         self.points = move_points(motion, self.points)
         self._last = move_points(motion, self._last[None])[0]
 
     def _take_back(self, pose: Array) -> None:
-        """Shorten the path if the vehicle drove backwards to `pose` (3,)."""
+        """Shorten the path if the vehicle has reversed to `pose` (3,)."""
         heading = np.array([np.cos(pose[2]), np.sin(pose[2])])
         moved = pose[:2] - self._last
         self._last = pose[:2].copy()
@@ -105,7 +105,7 @@ class DrivenPath:
             self.curvature += CURVATURE_GAIN * (now - self.curvature)
 
     def ahead(self, pose: Array, reach: float) -> PathAhead:
-        """Return the driven path, continued from `pose` (3,) by an arc of `reach` metres."""
+        """Continue the driven path from `pose` (3,) by an arc of `reach` metres."""
         s = np.arange(0.0, reach + STEP, STEP)
         angle = 0.5 * self.curvature * s
         chord = s * np.sinc(angle / np.pi)
@@ -116,11 +116,11 @@ class DrivenPath:
 
 
 along_and_across: Final = kernels.along_and_across
-"""The stations (m,) and signed distances (m,), left positive, of points (m, 2) beside a polyline."""
+"""Stations (m,) and signed distances (m,), left positive, of points (m, 2) beside a polyline."""
 
 
 def crosses(begin: Array, ends: Array, line: Array) -> BoolArray:
-    """Return whether each segment from `begin` (2,) to one of `ends` (k, 2) crosses a polyline (n, 2)."""
+    """Whether each segment from `begin` (2,) to one of `ends` (k, 2) crosses a polyline (n, 2)."""
     step, relative = ends - begin, line - begin
     beside = step[:, :1] * relative[:, 1] - step[:, 1:] * relative[:, 0]
     edge = np.diff(line, axis=0)
@@ -130,25 +130,25 @@ def crosses(begin: Array, ends: Array, line: Array) -> BoolArray:
     return np.asarray(parts.any(axis=1))
 
 
-# --- cones that come next --------------------------------------------------------------------------------
+# --- the next cones --------------------------------------------------------------------------------------
 
-LATERAL_CHANGE: Final = 1.5  # how much farther from the path the next cone may be than the newest ones (m)
+LATERAL_CHANGE: Final = 1.5  # largest increase of the distance from the path to the next cone (m)
 LATERAL_RATE: Final = 0.2  # growth of `LATERAL_CHANGE` with the distance along the path (m/m)
-ROW_BESIDE: Final = 2.0  # distance along the path below which cones stand beside each other (m)
-LATERAL_GAP: Final = 0.8  # by how much a cone must be nearer to the path to hide one beside it (m)
-STATION_MARGIN: Final = 0.3  # least distance past the end of a curve of what extends it (m along the path)
+ROW_BESIDE: Final = 2.0  # largest distance along the path of cones beside each other (m)
+LATERAL_GAP: Final = 0.8  # least difference of distances by which a cone hides another one beside it (m)
+STATION_MARGIN: Final = 0.3  # least distance of the next cone past the end of a curve (m along the path)
 END_BEHIND: Final = 5.0
-"""Farthest that the end of a curve is behind the vehicle (m along the path), since a stranded end is carried
-on. An older stretch of the path across the infield may be nearer to it."""
-STRANDED: Final = 2.0  # distance behind the vehicle beyond which an end without candidates is carried on (m)
-CARRIED_TO: Final = 1.0  # distance behind the vehicle to which a stranded end is carried on (m)
-MIN_LATERAL: Final = 0.5  # least distance from the path of an end that is carried on (m)
-MIN_CARRY: Final = 0.5  # least length by which an end is carried on (m)
+"""Largest distance of the end of a curve behind the vehicle (m along the path); a stranded end is
+extrapolated. An older stretch of the path across the infield may be nearer to the end."""
+STRANDED: Final = 2.0  # distance behind the vehicle from which an end without candidates is extrapolated (m)
+CARRIED_TO: Final = 1.0  # distance behind the vehicle of an end after its extrapolation (m)
+MIN_LATERAL: Final = 0.5  # least distance from the path of an extrapolated end (m)
+MIN_CARRY: Final = 0.5  # least length of an extrapolation (m)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Points that a boundary may be extended through."""
+    """Points through which a boundary may be extended."""
 
     points: Array  # (n, 2) positions (x, y) in m, map frame
     indices: IntArray  # (n,) index of each among the tentative tracks, or among a cycle's detections
@@ -156,7 +156,7 @@ class Candidates:
     sides: Array  # (n,) distance of each from the path (m), positive on the boundary's own side
 
     def where(self, chosen: IntArray | BoolArray) -> Self:
-        """Return the chosen candidates, in the given order if they are chosen by index."""
+        """Select candidates, in the given order if by index."""
         return type(self)(
             self.points[chosen], self.indices[chosen], self.stations[chosen], self.sides[chosen]
         )
@@ -172,13 +172,13 @@ class End:
 
 
 def chain(candidates: Candidates, end: End | None) -> IntArray:
-    """Return the indices of the candidates, sorted by station, that may follow one another.
+    """Select candidates, sorted by station, that may follow one another; return their indices.
 
     A candidate i may follow a cone j of the row if `side_i <= side_j + LATERAL_CHANGE + LATERAL_RATE (s_i -
-    s_j)`. It is held against the end of the curve and all candidates before it: against its neighbour alone a
-    row would drift to the next lane's, step by step, and against the end alone jump there. Without a curve
-    the first candidate takes the place of the end. Of candidates at about the same station only those nearest
-    to the path remain: a second row is of another stretch of the track.
+    s_j)`. It is compared with the end of the curve and all candidates before it. By its neighbour alone, a
+    row would drift to the next lane step by step; by the end alone, it would jump there. Without a curve the
+    first candidate replaces the end. Of candidates at about the same station only the nearest to the path
+    remain: a second row is of another stretch of the track.
     """
     stations, sides = candidates.stations, candidates.sides
     in_front = np.flatnonzero(in_front_row(stations, sides, ROW_BESIDE, LATERAL_GAP))
@@ -190,9 +190,10 @@ def chain(candidates: Candidates, end: End | None) -> IntArray:
 
 
 def in_front_row(stations: Array, sides: Array, beside: float, gap: float) -> BoolArray:
-    """Return which points are in the row nearest to the path, from their stations and sides (n,), in m.
+    """Whether points are in the row nearest to the path, by their stations and sides (n,), in m.
 
-    A point is behind it if another one within `beside` (m) along the path is nearer by more than `gap` (m).
+    A point is behind that row if another one within `beside` (m) along the path is nearer by more than `gap`
+    (m).
     """
     near = np.abs(stations - stations[:, None]) < beside
     return np.asarray(~(near & (sides < sides[:, None] - gap)).any(axis=1))

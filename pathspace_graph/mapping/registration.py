@@ -1,4 +1,4 @@
-"""Registration of detections with a stretch of the curves: it finds the loop closure, and a lost vehicle."""
+"""Registration of detections with a stretch of the curves, for loop closure and relocalization."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,18 +16,18 @@ from .curve_map import CurveMap
 from .path import DrivenPath
 from .state import Curves, State
 
-HEADING: Final = 0.8  # largest angle between the headings now and at the beginning for closing (rad)
+HEADING: Final = 0.8  # largest angle between the headings of two passes of one place (rad)
 START_LATERAL: Final = 5.0  # largest distance from the start at which its line is crossed to close a loop (m)
-START_HEADING: Final = 0.5  # largest angle between the directions of the start and of that crossing (rad)
-REGISTERED_AGE: Final = 2.0  # age of the oldest detections that are registered (s)
+START_HEADING: Final = 0.5  # largest angle between the heading at the start and that crossing (rad)
+REGISTERED_AGE: Final = 2.0  # largest age of registered detections (s)
 BEGINNING: Final = 60.0  # length of the curves that counts as their beginning (m)
 BEGINNING_SHARE: Final = 0.6  # largest share of a short curve that counts as its beginning
-REGISTERED_REACH: Final = 3.0  # largest distance from the curves that the first iteration uses (m)
+REGISTERED_REACH: Final = 3.0  # largest distance from the curves in the first iteration (m)
 REGISTERED_SHRINK: Final = 0.7  # factor for each further iteration, down to `closing.inlier_distance`
 REGISTERED_ITERATIONS: Final = 7
-START_STEP: Final = 2.0  # distance of the poses of the beginning where a lost vehicle is tried (m)
-START_CHI2: Final = 16.3  # their squared Mahalanobis distance at most: 99.9 % of chi-square, 3 degrees
-REGISTERED_DETECTIONS: Final = 25
+START_STEP: Final = 2.0  # distance of the poses of the beginning at which a lost vehicle is tried (m)
+START_CHI2: Final = 16.3  # largest squared Mahalanobis distance of these: 99.9 % of chi-square, 3 degrees
+REGISTERED_DETECTIONS: Final = 25  # least number of registered detections
 MIN_INLIERS: Final = 5  # least number of inliers on each boundary
 
 
@@ -39,7 +39,7 @@ class Motion:
     vector: Array  # (3,) translation (x, y) in m after the rotation by the third entry (rad)
 
     def apply(self, points: Array) -> Array:
-        """Return the moved points (m, 2)."""
+        """Move points (m, 2)."""
         c, s = np.cos(self.vector[2]), np.sin(self.vector[2])
         turned = (points - self.centre) @ np.array([[c, s], [-s, c]])
         return np.asarray(turned + self.centre + self.vector[:2])
@@ -52,30 +52,30 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Coloured detections, where the vehicle believes that they are."""
+    """Coloured detections at the present estimate of the poses."""
 
     rows: IntArray  # (m,) rows of the detections in their table
     labels: IntArray
     points: Array  # (m, 2) positions in m, map frame
     covariances: Array  # (m, 2, 2) covariances in m^2, map frame
-    explained: BoolArray  # (m,) whether the newest curves explain it, so that it can contradict a place
+    explained: BoolArray  # (m,) whether the newest curves explain it, so that it may contradict a place
 
     @classmethod
     def of_points(cls, rows: IntArray, labels: IntArray, points: Array) -> Self:
-        """Return sightings that all count the same, by the least deviation of the registration."""
+        """Build sightings of equal weight, with no covariance of their own."""
         return cls(rows, labels, points, np.zeros((len(rows), 2, 2)), np.ones(len(rows), bool))
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """The detections whose foot points are inside a stretch of their curve, for one motion."""
+    """Detections with foot points inside a stretch of their curve, for one motion."""
 
     rows: IntArray  # (m,) rows of the detections in their table
     labels: IntArray
     u: Array  # (m,) parameters of the foot points (m)
     inlier: BoolArray  # (m,) whether the detection is within `inlier_distance` of the curve
     explained: BoolArray  # (m,) whether the newest curves explain the detection
-    hessian: Array  # (3, 3) information about the motion, from the detections within reach
+    hessian: Array  # (3, 3) information of the motion, from the detections within reach
     negative_gradient: Array  # (3,) negative gradient of the cost by the motion, from the same detections
 
     def inliers(self, label: int) -> tuple[IntArray, Array]:
@@ -86,16 +86,16 @@ class Matches:
 
 @dataclass(frozen=True, eq=False)
 class RefinedMotion:
-    """Motion at the end of the registration."""
+    """Result of the registration."""
 
-    motion: Motion  # motion of the detections onto their curves
+    motion: Motion  # of the detections onto their curves
     matches: Matches
     covariance: Array  # (3, 3) covariance of the motion (m, m, rad)
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Detections, and the stretch (low, high) of each curve, by label, that they are registered with."""
+    """Detections, and the stretch (low, high) of each curve, by label, to register them with."""
 
     state: State
     seen: Sightings
@@ -107,7 +107,7 @@ class Registration:
         return self.state.whole_curves
 
     def refine(self, start: Motion, mean: Array, information: Array) -> RefinedMotion:
-        """Refine a motion by iterated closest points; its prior has a mean (3,) and an information (3, 3)."""
+        """Refine a motion by iterated closest points; its prior has a mean (3,) and information (3, 3)."""
         vector = start.vector
         for iteration in range(REGISTERED_ITERATIONS):
             reach = max(self.settings.inlier_distance, REGISTERED_REACH * REGISTERED_SHRINK**iteration)
@@ -139,7 +139,7 @@ class Registration:
 
 
 def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool:
-    """Return whether a pose (3,) may be on the beginning again: after a long path, near it, and along it."""
+    """Whether a pose (3,) may be on the beginning again: after a long path, near it, and in its direction."""
     if path.length < settings.min_path:
         return False
     away = np.hypot(*(path.beginning[:, :2] - pose[:2]).T)
@@ -148,7 +148,7 @@ def near_start(path: DrivenPath, pose: Array, settings: ClosingSettings) -> bool
 
 
 def passes_start(state: State, path: DrivenPath, motion: Motion) -> bool:
-    """Return whether the newest path, moved, crosses the line at which the drive began, on its road.
+    """Whether the newest path, moved, crosses the start line on its road.
 
     In each round of a skidpad the vehicle is on its beginning again, but has not closed a lap.
     """
@@ -159,14 +159,14 @@ def passes_start(state: State, path: DrivenPath, motion: Motion) -> bool:
         u = np.arange(0.0, min(BEGINNING, boundary.confirmed_end), boundary.settings.search_step)
         curve = boundary.evaluate(state.control_points(label), u) - start
         _, beside = curve[np.hypot(*curve.T).argmin()] @ turn
-        crosses &= (left - beside) * beside < 0.0  # on the same side of it as the start
+        crosses &= (left - beside) * beside < 0.0  # on the start's side of the boundary
     return bool(crosses.any())
 
 
 def start_crossings(path: Array, start: Array) -> tuple[BoolArray, Array]:
-    """Return which steps (n - 1,) of a path (n, 2) cross the line of a start (3,), and how far to its left.
+    """Return whether steps (n - 1,) of a path (n, 2) cross the line of a start (3,), and the ends' offsets.
 
-    They do so in its direction. The distances (n - 1,) are those of the ends of the steps (m).
+    A crossing is in the direction of the start. Offsets (n - 1,) are in m, positive to its left.
     """
     ahead, left = to_vehicle(path, start[None]).T
     steps, forward = np.hypot(np.diff(ahead), np.diff(left)), np.diff(ahead)
@@ -180,8 +180,8 @@ def register(
     """Register the newest detections with the beginning of the curves; return None if they disagree.
 
     Iterated closest points on the curves minimize `sum (n . (M p - S(u)))^2 / sigma^2 + m' P^-1 m`. The
-    `covariance` P (3, 3) of the newest pose is the prior, because detections along a straight or an arc leave
-    the motion free. If P is larger than the iteration can bridge, it starts from the best pose of the
+    `covariance` P (3, 3) of the newest pose is the prior, since detections along a straight or an arc do not
+    determine the motion. If P exceeds the range of convergence, the iteration starts at the best pose of the
     `beginning` (k, 3) of the drive. `times` are the stamps of the poses (s).
     """
     registration, state = _with_beginning(track, times, settings), track.state
@@ -200,19 +200,19 @@ def register(
 
 
 def is_within_reach(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> bool:
-    """Return whether the newest detections reach the beginning: otherwise only a lost vehicle registers."""
+    """Whether the newest detections reach the beginning; otherwise only a lost vehicle can register."""
     unmoved = Motion(track.state.poses[-1, :2], np.zeros(3))
     return bool(_with_beginning(track, times, settings).match(unmoved, REGISTERED_REACH).hessian.any())
 
 
 def is_lost(covariance: Array, settings: ClosingSettings) -> bool:
-    """Return whether a pose with this covariance (3, 3) is less certain than the registration can bridge."""
+    """Whether a pose with this covariance (3, 3) exceeds the registration's range of convergence."""
     prior = np.linalg.inv(covariance * settings.prior_scale**2)
     return bool(np.linalg.eigvalsh(prior[:2, :2])[0] < REGISTERED_REACH**-2)
 
 
 def _with_beginning(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> Registration:
-    """Return the registration of the coloured detections of the newest poses with the curves' beginning."""
+    """Set up the registration of the newest coloured detections with the beginning of the curves."""
     detections, variables, stamps = track.detections, track.variables, np.asarray(times)
     rows = np.flatnonzero(stamps[detections.cycle - variables.first_cycle] > stamps[-1] - REGISTERED_AGE)
     rows = rows[np.isin(detections.label[rows], list(track.state.boundaries))]
@@ -226,7 +226,7 @@ def _with_beginning(track: CurveMap, times: Sequence[float], settings: ClosingSe
 
 
 def by_motion(normals: Array, arms: Array) -> Array:
-    """Return the derivatives (m, 3) of distances across curves by a motion about the arms' origin.
+    """Derivatives (m, 3) of distances across curves by a motion about the arms' origin.
 
     The normals (m, 2) are unit vectors, and the arms (m, 2) lead to the points (m), both in the map frame.
     """
@@ -235,22 +235,22 @@ def by_motion(normals: Array, arms: Array) -> Array:
 
 
 def worst_sigma(covariance: Array) -> float:
-    """Return the standard deviation (m) of a position in its worst direction, by covariance (3, 3)."""
+    """Standard deviation (m) of a position in its worst direction, by covariance (3, 3)."""
     (a, b), (_, d) = covariance[:2, :2].tolist()
     return sqrt(0.5 * (a + d) + hypot(0.5 * (a - d), b))
 
 
 def sigma_of_information(information: Array) -> float:
-    """Return `worst_sigma` of an information (3, 3); it is infinite where a direction is not held."""
+    """`worst_sigma` of an information (3, 3); infinite if a direction is not observed."""
     if np.linalg.matrix_rank(information) < len(information):
         return np.inf
     return worst_sigma(np.asarray(np.linalg.inv(information), np.float64))
 
 
 def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bool:
-    """Return whether nearly all of enough detections are inliers, on a long stretch of every boundary.
+    """Whether nearly all of enough detections are inliers, on a long stretch of every boundary.
 
-    Outliers count only if the newest curves explain them: others are clutter, or of road not mapped yet.
+    Outliers count only if the newest curves explain them: others are clutter, or of unmapped road.
     """
     asked = matches.explained
     count, inliers = int(asked.sum()), int(matches.inlier[asked].sum())
@@ -261,10 +261,10 @@ def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bo
 
 
 def is_certain(matches: Matches, posterior: Array, settings: ClosingSettings, lost: bool = False) -> bool:
-    """Return whether the motion is certain in every direction.
+    """Whether the motion is certain in every direction.
 
-    The limit is wider once a long stretch of the beginning was driven again, as more detections would add
-    little, unless the vehicle is `lost`: then one place along a straight agrees as well as the next.
+    The limit is wider after a long stretch of the beginning was driven again, since more detections would add
+    little. It stays for a `lost` vehicle, because any place along a straight agrees equally well.
     """
     sigma = worst_sigma(posterior)
     driven_again = float(np.median(matches.u[matches.inlier]))

@@ -1,6 +1,6 @@
-"""The road: all that is estimated, and the steps of the paper that change it.
+"""The road: everything that is estimated, and the steps of the paper that change it.
 
-The order of a cycle is that of the paper: predict, classify, expand, update, and at its end marginalize.
+A cycle follows the paper: predict, classify, expand, update, and finally marginalize.
 """
 
 from collections.abc import Sequence
@@ -24,21 +24,21 @@ from .orange import OrangeCones, Sighting
 from .path import DrivenPath
 from .smoother import CurveSmoother, Gating
 
-HELD: Final = "the user's factors hold the open map in its frame: it is not relinearized as a whole any more"
+HELD: Final = "the user's factors fix the frame of the open map: it is no longer relinearized as a whole"
 
 
 @dataclass(frozen=True, eq=False)
 class Classified:
     """The detections of a cycle after their association."""
 
-    new: slice  # their rows in the table of detections
-    tested: Gating | None  # the coloured ones, as they were tested; None without any curve
+    new: slice  # rows in the table of detections
+    tested: Gating | None  # test of the coloured detections; None without a curve
 
 
 class Road:
-    """Window and prior, both curves, tentative and orange cones, and the path driven.
+    """Window and prior, both curves, tentative and orange cones, and the driven path.
 
-    `copy` returns a road that goes on independently: it is what a failed cycle goes back to.
+    A failed cycle goes back to a `copy`.
     """
 
     SMOOTHER: ClassVar = CurveSmoother  # class of its window and prior
@@ -53,11 +53,11 @@ class Road:
         self.orange = OrangeCones(settings.growth, settings.spline.sigma_shape)
         """Orange cones, which are points of the map."""
         self.grown: frozenset[int] = frozenset()
-        """Curves that have grown in the newest cycle: the next one tests all of the window for them."""
+        """Curves that grew in the newest cycle; the next one tests the whole window for them."""
         self._attach()
 
     def copy(self) -> Self:
-        """Return a road that can go on independently; what is only ever replaced is shared."""
+        """Return an independent copy; attributes that are only replaced are shared."""
         other = shallow(self)
         other.smoother = self.smoother.copy()
         other.path = self.path.copy()
@@ -72,11 +72,11 @@ class Road:
     # --- the steps of a cycle ----------------------------------------------------------------------------
 
     def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> str:
-        """Add the user's factors, after their check; return a notice where that switches something off."""
+        """Check and add the user's factors; return a notice if that disables something."""
         return HELD if factors and self.smoother.add_factors(factors) else ""
 
     def rows_of(self, factors: Sequence[gtsam.NonlinearFactor]) -> list[Rows] | None:
-        """Return the user's factors on poses as rows for a batch; None where one holds points of the map."""
+        """Convert the user's factors on poses to rows for a batch; None if one is on points of the map."""
         return rows_on_poses(factors, self.smoother.variables, self.next_cycle - 1)
 
     def predict(self, motion: MeasuredMotion, orange: Detections) -> None:
@@ -87,9 +87,9 @@ class Road:
         self.orange.add(seen, self.smoother.variables.sensor)
 
     def classify(self, detections: Detections, twist: Array, *, use: bool = True) -> Classified:
-        """Add the detections of the newest pose, and put those into use that a curve explains.
+        """Add the detections of the newest pose, and use the ones that a curve explains.
 
-        Others may expand an open curve later. Without `use`, none is put into use.
+        Others may expand an open curve later. Without `use`, none is used.
         """
         track, cycle = self.smoother.map, self.smoother.next_cycle - 1
         new = track.detections.append(detections, cycle, twist)
@@ -99,7 +99,7 @@ class Road:
         return Classified(new, tested)
 
     def expand(self) -> str:
-        """Let open curves grow, and leave the part of the map behind inactive; return a notice."""
+        """Grow open curves, and deactivate the part of the map behind; return a notice."""
         self.grown, notice = frozenset(), ""
         if not self.closed:
             path_ahead = self.path.ahead(self.poses[-1], self.settings.growth.reach)
@@ -110,24 +110,24 @@ class Road:
         return notice
 
     def update(self) -> None:
-        """Take the Gauss-Newton steps of a cycle, each relinearized at the current estimate."""
+        """Take the Gauss-Newton steps of a cycle, each linearized at the current estimate."""
         for _ in range(self.settings.steps_grown if self.grown else self.settings.steps):
             self.smoother.step(self.settings.sigma_step)
 
     def marginalize(self, held_from: int | None = None) -> None:
-        """Marginalize poses older than the lag; the cycles from `held_from` on stay."""
+        """Marginalize poses older than the lag, except for cycles from `held_from` on."""
         self.smoother.marginalize(held_from)
 
     # --- the estimate ------------------------------------------------------------------------------------
 
     @property
     def closed(self) -> bool:
-        """Return whether the curves are closed: the map has its final size."""
+        """Whether the curves are closed, so that the map has its final size."""
         return self.smoother.map.state.closed
 
     @property
     def boundaries(self) -> dict[int, Boundary]:
-        """Return the curves by label."""
+        """Curves by label."""
         return self.smoother.map.state.boundaries
 
     @property
@@ -136,7 +136,7 @@ class Road:
 
     @property
     def poses(self) -> Array:
-        """Return a view of the poses (P, 3) in the window, the oldest first, map frame."""
+        """View of the poses (P, 3) in the window, the oldest first, map frame."""
         return self.smoother.variables.poses
 
     @property
@@ -144,16 +144,16 @@ class Road:
         return self.smoother.next_cycle
 
     def used_in_newest(self) -> int:
-        """Return the number of the newest cycle's detections that are in use."""
+        """Number of used detections of the newest cycle."""
         detections = self.smoother.map.detections
         return int(detections.used[detections.cycle.searchsorted(self.next_cycle - 1) :].sum())
 
     def place_orange(self, corrected: Array) -> None:
-        """Place the orange cones anew by the corrected poses (k, 3) of the first cycles and the window's."""
+        """Place the orange cones again, by corrected poses (k, 3) of the first cycles and the window's."""
         window = self.smoother.first_cycle, self.poses
         self.orange.place_again(self.smoother.variables.sensor, (0, corrected), window)
 
     def move(self, motion: Array) -> None:
-        """Move what is not a variable by a rigid motion (3,) of the map frame."""
+        """Move path, tracks and cones, which are no variables, by a rigid motion (3,) of the map frame."""
         for one in self.smoother.attached:
             one.move(motion)

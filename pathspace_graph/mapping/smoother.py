@@ -1,4 +1,4 @@
-"""The fixed-lag engine on both boundaries' curves: association, and the active part of the map."""
+"""The fixed-lag engine on the curves of both boundaries: association, and the active part of the map."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -22,15 +22,15 @@ from .motion import smoother_settings
 
 @dataclass(frozen=True, eq=False)
 class Gating:
-    """The coloured detections of the newest pose, as they were tested."""
+    """Gating of the coloured detections of the newest pose."""
 
     rows: IntArray  # (k,) detections, by row of the table
     in_view: BoolArray  # (k,) whether the detection lies beside the part of its curve that the pose sees
-    innovation: Array  # (k,) distance of each from its curve before the update, in standard deviations of it
+    innovation: Array  # (k,) distance from the curve before the update, in sigmas
 
 
 class CurveSmoother(FixedLagSmoother[CurveMap]):
-    """Window, prior and map of the two curves, with the association of detections with them."""
+    """Window, prior and map of the two curves, with the association of detections."""
 
     MAP: ClassVar = CurveMap  # class of the curves' rows
 
@@ -40,22 +40,22 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         self.attached = [self.map]
 
     def settle(self) -> None:
-        """Relinearize only what moves from now on: once the loop has closed, hardly anything does."""
+        """Relinearize only what moves from now on; after loop closure, that is little."""
         self.window.exact = False
 
     def newest_covariance(self) -> Array:
-        """Return the covariance (3, 3) of the newest pose (m, m, rad), map frame."""
+        """Covariance (3, 3) of the newest pose (m, m, rad), map frame."""
         return self.covariance(pose_keys(np.array([self.next_cycle - 1])))
 
     # --- association -------------------------------------------------------------------------------------
 
     def associate(self, retest: frozenset[int], use: bool = True) -> Gating:
-        """Put detections into use that lie on a curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
+        """Use detections that pass the gate of a curve: `d^2 < chi^2 (sigma^2 + g' Sigma g)`.
 
         d is the signed distance, sigma its own standard deviation, and g its gradient by pose and control
-        points, whose joint covariance is Sigma. The newest pose's detections are tested, and all unused ones
-        of the window for the labels in `retest`, whose curves have grown. A detection of unknown colour is
-        used if exactly one curve accepts it. The same search finds the newest pose's parameter on each curve;
+        points with the joint covariance Sigma. The detections of the newest pose are tested, and all unused
+        ones of the window for the labels in `retest`, whose curves have grown. A detection of unknown colour
+        is used if exactly one curve accepts it. The same search locates the newest pose on each curve;
         without `use`, nothing else is done.
         """
         detections = self.map.detections
@@ -70,16 +70,16 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         return Gating(rows[judged], foot.interior[judged], innovation[judged])
 
     def reassociate(self) -> None:
-        """Associate all detections of the window with new curves, on which the poses have been located.
+        """Associate all detections of the window with new curves, on which the poses are located.
 
-        The uncertainty is that of the prior and the odometry alone, since no detection is in use.
+        The uncertainty is that of prior and odometry alone, since no detection is in use.
         """
         self.map.detections.release_all()
         self.factorize()
         self._associate(*self._untested(frozenset(self.map.state.boundaries)))
 
     def _associate(self, rows: IntArray, curve: IntArray) -> None:
-        """Put those detections (m,) into use that pass the gate of their curve (m,), by all poses' places."""
+        """Use detections (m,) that pass the gate of their curve (m,), by the places of all poses."""
         state, detections, gate = self.map.state, self.map.detections, self.map.settings.gate
         points = detections.points_map(rows, self.variables)
         pose_u = np.array([state.pose_u[label] for label in state.boundaries])
@@ -88,14 +88,14 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         self._accept(rows, curve, points, state.curves.find(state.map_points, points, curve, *stretch))
 
     def _accept(self, rows: IntArray, curve: IntArray, points: Array, foot: FootPoints) -> Array:
-        """Put detections (m,) into use that pass the gate of their curve (m,); return the innovations."""
+        """Use detections (m,) that pass the gate of their curve (m,); return innovations (m,) in sigmas."""
         detections, state, gate = self.map.detections, self.map.state, self.map.settings.gate
         sigma_model = self.map.settings.spline.sigma_model
         limits = (sigma_model, gate.sigma_floor, gate.rough, gate.chi, gate.chi_unknown, UNKNOWN)
         columns = detections.cycle, detections.label, detections.covariance
         poses, at = (self.variables.poses, self.first_cycle), (foot.normal_unit, foot.distance, foot.interior)
         variance, accepted, doubtful = kernels.gated(rows, *columns, *poses, at, limits)
-        if doubtful.any():  # the joint uncertainty is costly, and only these need it
+        if doubtful.any():  # the joint uncertainty is costly: compute it for these only
             variance[doubtful] += self.joint_variance(rows[doubtful], points[doubtful], foot.where(doubtful))
             accepted[doubtful] = foot.distance[doubtful] ** 2 < gate.chi**2 * variance[doubtful]
         taken = rows[accepted]
@@ -107,16 +107,16 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         return np.asarray(foot.distance / np.sqrt(variance))
 
     def _untested(self, retest: frozenset[int]) -> tuple[IntArray, IntArray]:
-        """Return the detections (m,) to test, and the index (m,) of the curve that each is tested for."""
+        """Return the detections (m,) to test, and the index (m,) of the curve to test each for."""
         detections, labels = self.map.detections, self.map.state.curves.labels
         newest = int(detections.cycle.searchsorted(self.next_cycle - 1))
         since = np.array([0 if label in retest else newest for label in labels.tolist()], np.intp)
         return detections.open_to(labels, since)
 
     def joint_variance(self, rows: IntArray, points: Array, foot: FootPoints) -> Array:
-        """Return `g_i' Sigma g_i` (m,) in m^2 of detections (m,) at points (m, 2), map frame.
+        """Variance `g_i' Sigma g_i` (m,) of the residuals of detections (m,) at points (m, 2), map frame.
 
-        It is the variance of each residual by pose, control points and calibration of the sensor.
+        It is in m^2, by pose, control points and calibration of the sensor.
         """
         detections, sigma_model = self.map.detections, self.map.settings.spline.sigma_model
         seen = rows_across(self.map.state, detections, rows, points, foot, sigma_model)
@@ -150,22 +150,22 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         return FootPoints(*foot)
 
     def _relocated(self, label: int) -> float:
-        """Return the parameter of a vehicle that was not found beside the curve in the ordinary search."""
+        """Find the parameter of a vehicle that the ordinary search has not found beside the curve."""
         state, room = self.map.state, self.map.settings.gate.station_room
         boundary = state.boundaries[label]
         low = np.array([boundary.confirmed_end - room - boundary.settings.refine_room])
         if boundary.periodic or boundary.tables.locate(low)[0][0] < state.active(label)[0]:
-            self.refresh()  # the search reaches inactive control points, which may be out of date
+            self.refresh()  # the search reaches inactive control points, which may be outdated
         return relocate(boundary, state.control_points(label), state.poses[-1], room)
 
     # --- the active part ---------------------------------------------------------------------------------
 
     def deactivate_distant(self) -> None:
-        """Restrict each step to what the window can touch, and some room for the next cycles.
+        """Restrict steps to the control points that the window can reach, and some room for the next cycles.
 
-        A closed map's active part is chosen again when it no longer holds what the window needs. The inactive
-        part of an open one grows as the vehicle drives on. What is inactive keeps its linearization, by which
-        the map differs from one that is solved whole (`FarSettings`).
+        The active part of a closed map is chosen again when it does not contain what the window needs. The
+        inactive part of an open map grows with the drive. Inactive control points keep their linearization
+        point; the map differs by this from one that is solved as a whole (`FarSettings`).
         """
         state = self.map.state
         needed = {label: self._needed(label) for label in state.boundaries}
@@ -196,10 +196,10 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         return max(behind) * settings.spline.spacing >= settings.far.stretch
 
     def _needed(self, label: int, room: float = 0.0) -> IntArray:
-        """Return the control points (k,) that the window sees until the next cycle, and `room` (m) ahead.
+        """Control points (k,) that the window can reach until the next cycle, and `room` (m) ahead.
 
-        Detections in use may lie farther behind than a pose sees, since the road that they were seen from has
-        moved since.
+        Used detections may lie farther behind than a pose sees, since the road has moved after they were
+        made.
         """
         boundary, pose_u = self.map.state.boundaries[label], self.map.state.pose_u[label]
         gate, slide = self.map.settings.gate, self.map.settings.spline.refine_room
@@ -220,5 +220,5 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
 
 
 def _holds(active: IntArray, needed: IntArray, size: int) -> bool:
-    """Return whether one stretch of a boundary's `size` control points holds another; indices may wrap."""
+    """Whether one stretch of a boundary's `size` control points contains another; indices may wrap."""
     return int(needed[0] - active[0]) % size + len(needed) <= len(active)

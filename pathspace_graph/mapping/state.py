@@ -1,4 +1,4 @@
-"""The state of the spline estimators: curves, and the variables of their control points and poses."""
+"""State of the spline estimators: curves, and the variables of control points and poses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials
-from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.graph.drives import ONE_DRIVE, Drives
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
@@ -24,24 +24,24 @@ from pathspace_graph.graph.variables import (
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
-POINTS_PER_FACTOR: Final = 6  # consecutive control points whose weak priors are one factor
-SAMPLE: Final = 0.25  # step at which curves are sampled for comparison with curves and cones (m)
+POINTS_PER_FACTOR: Final = 6  # number of consecutive control points whose weak priors form one factor
+SAMPLE: Final = 0.25  # step of the samples of curves that are compared with curves and cones (m)
 
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """The active parts of all curves by label, whose control points are the rows of `State.map_points`."""
+    """The active parts of all curves; their control points are the rows of `State.map_points`."""
 
     boundaries: tuple[Boundary, ...]
     labels: IntArray  # (k,) labels of the curves, ascending
     active: tuple[IntArray, ...]  # active control points of each curve, by index
-    tables: tuple[SpanPolynomials, ...]  # tables of each whole curve
+    tables: tuple[SpanPolynomials, ...]  # bases of the whole curves
     active_from: Array  # (k,) parameter before which an open curve is inactive; -inf if all is active
     keys: IntArray  # (m,) keys of all control points
 
     @classmethod
     def of(cls, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> Self:
-        """Lay out boundaries, at least one, with the active control points (k,) of each."""
+        """Lay out at least one boundary, with the active control points (k,) of each."""
         curves, active_of = tuple(boundaries.values()), tuple(active[label] for label in boundaries)
         first = _first_active(curves, active_of)
         begins = [_tail(b, start).low if start else -np.inf for b, start in zip(curves, first, strict=True)]
@@ -63,23 +63,23 @@ class Curves:
         return kernels.Curves(bases, (np.cumsum([0, *sizes[:-1]]) + first).tolist(), sizes)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what is compiled, which is made again."""
+        """Leave out the compiled curves, which are made again."""
         return {name: value for name, value in vars(self).items() if name != "searched"}
 
     def is_of(self, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> bool:
-        """Return whether these are the curves of boundaries with active control points, by default all."""
+        """Whether these are the curves of the boundaries with these active control points, by default all."""
         tables = [boundary.tables for boundary in boundaries.values()]
         stretches = [active.get(label, boundary.everything) for label, boundary in boundaries.items()]
         known = *self.tables, *self.active
         return len(tables) == len(self.tables) and all(map(is_, (*tables, *stretches), known))
 
     def on(self, boundaries: Mapping[int, Boundary]) -> Self:
-        """Return the same curves laid out, of copies of their boundaries."""
+        """Return the same layout with copies of the boundaries."""
         return replace(self, boundaries=tuple(boundaries.values()))
 
     @cached_property
     def pairs(self) -> tuple[IntArray, Array, IntArray, IntArray]:
-        """Return the pairs of neighbouring active control points, by rows (r, 2) of `State.map_points`.
+        """Pairs of neighbouring active control points, by rows (r, 2) of `State.map_points`.
 
         Their nominal distances (r,) in m, keys (r, 2), and the numbers (r,) of their factors follow.
         """
@@ -95,20 +95,20 @@ class Curves:
 
     @property
     def trusted(self) -> Array:
-        """Return the parameter (k,) of each curve up to which foot points are allowed."""
+        """Parameter (k,) of each curve up to which foot points are allowed."""
         return np.array([boundary.trusted for boundary in self.boundaries])
 
     def find(
         self, control_points: Array, points: Array, curve: IntArray, low: Array, high: Array
     ) -> FootPoints:
-        """Search the foot point of each point (m, 2) on its own curve (m,) and stretch [low, high]."""
+        """Find the foot points of points (m, 2), each on its own curve (m,) and stretch [low, high]."""
         s, high = self.boundaries[0].settings, np.minimum(high, self.trusted[curve])
         search = (s.search_step, s.search_iterations)
-        return joint_foot_points(self.searched, control_points, points, curve, low, high, *search)
+        return FootPoints(*self.searched.search(control_points, points, curve, low, high, *search))
 
 
 def _first_active(boundaries: Sequence[Boundary], active: Sequence[IntArray]) -> list[int]:
-    """Return the first active control point of each boundary, by index; 0 where it is closed."""
+    """First active control point of each boundary, by index; 0 if closed."""
     return [0 if b.periodic else int(indices[0]) for b, indices in zip(boundaries, active, strict=True)]
 
 
@@ -117,21 +117,21 @@ def _tail(boundary: Boundary, first: int) -> SpanPolynomials:
 
 
 class State:
-    """The boundaries and the variables: control points (m) and poses (m, m, rad), map frame."""
+    """Boundaries, and the variables: control points (m) and poses (m, m, rad), map frame."""
 
     def __init__(self, variables: Variables | None = None, drives: Drives = ONE_DRIVE) -> None:
         self.variables = variables or Variables()  # control points, calibration and poses by key
         self.boundaries: dict[int, Boundary] = {}  # curves, sorted by label as their control points are
         self.active_stretch: dict[int, IntArray] = {}
-        """Active control points (k,) of a boundary that is partly inactive: one stretch in driving order, by
-        index from the boundary's first control point."""
-        self.drives = drives  # whose poses these are
+        """Active control points (k,) of a partly inactive boundary: one stretch in driving order, by index
+        from the boundary's first control point."""
+        self.drives = drives  # drives of the poses
         self.pose_u: dict[int, Array] = {}  # (P,) parameters of the poses, increasing from lap to lap
         self._curves: Curves | None = None
         self._whole_curves: Curves | None = None
 
     def copy(self) -> Self:
-        """Return a state whose boundaries, values and pose parameters can change independently."""
+        """Return an independent copy."""
         other = shallow(self)
         other.variables = self.variables.copy()
         other.boundaries = {label: shallow(boundary) for label, boundary in self.boundaries.items()}
@@ -142,32 +142,32 @@ class State:
         return other
 
     def keys(self, label: int) -> IntArray:
-        """Return the keys (m,) of a boundary's control points."""
+        """Keys (m,) of a boundary's control points."""
         return control_keys(label, self.boundaries[label].numbers)
 
     @property
     def map_keys(self) -> IntArray:
-        """Return the keys (m,) of all boundaries' control points, in the order of `map_points`."""
+        """Keys (m,) of all boundaries' control points, in the order of `map_points`."""
         return np.concatenate([np.zeros(0, np.intp), *(self.keys(label) for label in self.boundaries)])
 
     @property
     def map_points(self) -> Array:
-        """Return a view of all boundaries' control points (m, 2) in m, map frame."""
+        """View of all boundaries' control points (m, 2) in m, map frame."""
         layout, (left, right) = self.variables.layout, CONTROL_LETTERS
         both = slice(layout.block(left).start, layout.block(right).stop)
         return self.variables.values[both].reshape(-1, 2)
 
     def control_points(self, label: int) -> Array:
-        """Return a view of a boundary's control points (m, 2) in m, map frame."""
+        """View of a boundary's control points (m, 2) in m, map frame."""
         return self.variables.block(CONTROL_LETTERS[label]).reshape(-1, 2)
 
     @property
     def poses(self) -> Array:
-        """Return a view of the poses (P, 3), the oldest first."""
+        """View of the poses (P, 3), the oldest first."""
         return self.variables.poses
 
     def calibration_keys(self, drive: int) -> IntArray:
-        """Return the keys of a drive's calibrations: the odometry's, and the sensor's if it is estimated."""
+        """Keys of a drive's calibrations: of the odometry, and of the sensor if estimated."""
         keys = [CALIBRATION_KEY + drive, SENSOR_KEY + self.drives.sensors[drive]]
         return np.array(keys[: 2 if len(self.variables.sensor) else 1])
 
@@ -175,21 +175,21 @@ class State:
 
     @property
     def closed(self) -> bool:
-        """Return whether a curve is closed; both are closed together."""
+        """Whether a curve is closed; both are closed together."""
         return any(boundary.periodic for boundary in self.boundaries.values())
 
     def spline(self, label: int) -> BSpline:
-        """Return a boundary as a spline of its own, which later changes of the state leave alone."""
+        """Copy a boundary to a spline that is independent of the state."""
         return self.boundaries[label].spline(self.control_points(label).copy())
 
     @property
     def splines(self) -> dict[int, BSpline]:
-        """Return all boundaries as splines of their own, by label."""
+        """All boundaries as independent splines, by label."""
         return {label: self.spline(label) for label in self.boundaries}
 
     @property
     def curves(self) -> Curves:
-        """Return the boundaries, at least one, side by side; the result is cached."""
+        """Layout of the boundaries, at least one, with their active control points; cached."""
         known = self._curves
         if known is None or not known.is_of(self.boundaries, self.active_stretch):
             active = {label: self.active(label) for label in self.boundaries}
@@ -198,7 +198,7 @@ class State:
 
     @property
     def whole_curves(self) -> Curves:
-        """Return the boundaries side by side, with their inactive control points; the result is cached."""
+        """Layout of the boundaries with all control points; cached."""
         if self.whole:
             return self.curves
         known = self._whole_curves
@@ -213,7 +213,7 @@ class State:
         self.variables.insert(self.keys(label), control_points.ravel())
 
     def extend(self, label: int, points: Array) -> None:
-        """Add the variables of control points (k, 2) by which a boundary has grown; they are active."""
+        """Add the variables of control points (k, 2) by which a boundary has grown, as active ones."""
         size, count = self.boundaries[label].size, len(points)
         self.variables.insert(self.keys(label)[size - count :], points.ravel())
         if label in self.active_stretch:
@@ -225,33 +225,33 @@ class State:
         self.add_boundary(label, boundary, control_points)
 
     def close(self, label: int, boundary: Boundary) -> None:
-        """Replace an open boundary by a periodic one, whose control points are inserted by the smoother."""
+        """Replace an open boundary by a periodic one; the smoother inserts its control points."""
         self.boundaries[label] = boundary
 
     def replace_curves(self, boundaries: Mapping[int, Boundary]) -> None:
-        """Replace all boundaries by others, whose control points are inserted by the smoother."""
+        """Replace all boundaries; the smoother inserts their control points."""
         self.boundaries = dict(sorted(boundaries.items()))
 
     # --- active control points ---------------------------------------------------------------------------
 
     def active(self, label: int) -> IntArray:
-        """Return the indices (k,) of a boundary's active control points, in driving order."""
+        """Indices (k,) of a boundary's active control points, in driving order."""
         return self.active_stretch.get(label, self.boundaries[label].everything)
 
     @property
     def whole(self) -> bool:
-        """Return whether every control point is active."""
+        """Whether every control point is active."""
         return not self.active_stretch
 
     def activate(self, keys: IntArray) -> None:
-        """Make control points active, which lie next to the active ones."""
+        """Activate control points that are next to the active ones."""
         for label, indices in self.active_stretch.items():
             numbers = self.keys(label)[:1] + np.arange(indices[0])
             back = np.flatnonzero(np.isin(numbers, keys))
             self.active_stretch[label] = np.append(back, indices)
 
     def activate_only(self, active: dict[int, IntArray]) -> None:
-        """Make the given control points active, by label, and no others; all of a label that is missing."""
+        """Activate exactly these control points, by label; all of a missing label."""
         self.active_stretch = active
 
     def locate(self, label: int, pose_u: Array) -> None:
@@ -259,7 +259,7 @@ class State:
         self.pose_u[label] = pose_u
 
     def locate_newest(self, label: int, u: float) -> None:
-        """Add the newest pose's parameter; on a closed curve it goes on from lap to lap."""
+        """Add the newest pose's parameter; on a closed curve it increases from lap to lap."""
         boundary, known = self.boundaries[label], self.pose_u[label]
         if boundary.periodic:
             u += boundary.length * round((float(known[-1]) - u) / boundary.length)
@@ -271,5 +271,5 @@ class State:
 
 
 def factor_numbers(points: IntArray, label: int) -> IntArray:
-    """Return the number of the factor that has the weak priors of control points (k,), by index."""
+    """Number of the factor with the weak priors of control points (k,), by index."""
     return np.asarray(len(CONTROL_LETTERS) * (points // POINTS_PER_FACTOR) + label)

@@ -1,8 +1,9 @@
-"""Stations: where along closed curves their cones are, which tells where along them the vehicle is.
+"""Stations: positions of cones along closed curves, which constrain the vehicle along them.
 
-Distances across the curves say nothing along them. A cone of a closed map has a parameter on its curve, its
-station, and a detection that is of one cone beyond doubt gets a second row, along the tangent there. A
-station is no variable and a cone no landmark: the row moves the curve, the pose and the sensor's calibration.
+Distances across the curves do not constrain the pose along them. A cone of a closed map has a parameter on
+its curve, its station. A detection of an unambiguous cone gets a second row, along the tangent there.
+Stations are no variables and cones no landmarks: the row moves the curve, the pose and the sensor's
+calibration.
 """
 
 from collections.abc import Mapping
@@ -19,8 +20,8 @@ from .detection_rows import DetectionRows, measuring_keys
 from .detections import NO_STATION, DetectionTable
 from .state import State
 
-STATION_CERTAIN: Final = 3.0  # sigmas along a curve that are less than half the distance of the next cone
-SIGMA_POSE: Final = 0.2  # standard deviation of the vehicle along a curve when its detections are matched (m)
+STATION_CERTAIN: Final = 3.0  # gate along a curve (sigmas), less than half the distance of the next cone
+SIGMA_POSE: Final = 0.2  # standard deviation of the vehicle along a curve in the matching of detections (m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,15 +29,15 @@ class CurveStations:
     """The stations of one curve, ascending."""
 
     label: int  # of the boundary
-    first: int  # number of the first among those of all curves
-    u: Array  # parameters (k,) of the cones in m, within one length
-    sigma: Array  # standard deviations (k,) of the cones along the curve, given the curve (m)
-    apart: Array  # distances (k,) of each to the nearer one of its neighbours (m)
-    length: float  # length of the curve (m); infinity of an open one
+    first: int  # index of the first station among those of all curves
+    u: Array  # (k,) parameters of the cones, within one length (m)
+    sigma: Array  # (k,) standard deviations of the cones along the curve, given the curve (m)
+    apart: Array  # (k,) distances to the nearer neighbour (m)
+    length: float  # length of the curve (m); infinite if open
 
     @classmethod
     def of(cls, label: int, first: int, u: Array, sigma: Array, ends: tuple[float, float]) -> Self:
-        """Place cones at parameters (k,), at least one, of a curve; an open one ends at infinity."""
+        """Place at least one cone at parameters (k,) of a curve; an open one ends at infinity."""
         low, length = ends[0], ends[1] - ends[0]
         u = low + np.mod(u - low, length)
         order = np.argsort(u)
@@ -44,7 +45,7 @@ class CurveStations:
         return cls(label, first, u[order], sigma[order], np.minimum(gaps, np.roll(gaps, 1)), length)
 
     def nearest(self, u: Array) -> tuple[IntArray, Array]:
-        """Return the nearest station to each parameter, of any shape, and how far beyond it that is (m)."""
+        """Return the nearest station to each parameter, of any shape, and the distance beyond it (m)."""
         if self.length == np.inf:
             after = self.u.searchsorted(u).clip(1, len(self.u) - 1)
             both = np.stack([after - 1, after])
@@ -57,11 +58,10 @@ class CurveStations:
         return np.where(second, both[1], both[0]), np.where(second, beyond[1], beyond[0])
 
     def matched(self, u: Array, sigma: Array) -> IntArray:
-        """Return the number (m,) of the station of detections with foot points u (m,).
+        """Match detections with foot points u (m,) to stations; `NO_STATION` if ambiguous.
 
-        It is `NO_STATION` where that is in doubt.
-        Their standard deviations along the curve, with the vehicle's, are sigma (m,). Doubt is judged by what
-        is expected: a choice by the distances that were found would keep the small ones.
+        sigma (m,) are their standard deviations along the curve, with the vehicle's. Ambiguity is judged by
+        the expected distances: a choice by the observed ones would be biased to small distances.
         """
         station, beyond = self.nearest(u)
         limit = STATION_CERTAIN * np.hypot(sigma, self.sigma[station])
@@ -71,7 +71,7 @@ class CurveStations:
 
 @dataclass(frozen=True, eq=False)
 class Stations:
-    """The stations of all curves of a state, one curve after the other, and their basis functions."""
+    """The stations of all curves of a state, curve by curve, and the basis functions there."""
 
     curves: tuple[CurveStations, ...]
     u: Array  # (k,) parameters (m)
@@ -83,7 +83,7 @@ class Stations:
 
     @classmethod
     def of(cls, state: State, u: Mapping[int, Array], sigma: Mapping[int, Array]) -> Self:
-        """Place cones at parameters (k,) of curves, at least one on each; by label, as the sigmas."""
+        """Place cones at parameters (k,) of curves, at least one on each; both mappings are by label."""
         curves, columns, values, before, count = list[CurveStations](), [], [], 0, 0
         for label, boundary in state.boundaries.items():
             ends = boundary.tables.low, boundary.tables.high if boundary.periodic else np.inf
@@ -101,7 +101,7 @@ class Stations:
     def rows(
         self, state: State, detections: DetectionTable, rows: IntArray, station: IntArray, sigma: Array
     ) -> DetectionRows:
-        """Return `t . (R z + t - S(u))` of detections (m,) at stations (m,), whose sigmas (m,) are in m.
+        """Linearize `t . (R z + t - S(u))` for detections (m,) at stations (m,) with sigmas (m,) in m.
 
         The terms are those of `factors._kernels:station_rows`.
         """

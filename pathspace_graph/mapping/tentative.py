@@ -1,4 +1,4 @@
-"""Tentative tracks: cones that no curve explains yet, which one may explain later."""
+"""Tentative tracks: cones that no curve explains yet."""
 
 from collections.abc import Mapping
 from typing import Final, Self
@@ -12,9 +12,9 @@ from pathspace_graph.factors.se2 import move_points, rotated
 from pathspace_graph.settings.online import GrowthSettings
 
 MERGE_CHI: Final = 2.5  # gate of a smeared detection about a track, in sigmas of both together
-MERGE_MOST: Final = 2.0  # its limit in merge radii: the next cone of the row is farther away
+MERGE_MOST: Final = 2.0  # largest such gate, in merge radii: the next cone of the row is farther away
 RESTORED: Final = 0.3  # standard deviation of a cone that is taken back from a curve (m)
-MAX_TRACKS: Final = 1000  # tracks of each label that are kept, the ones that were seen last
+MAX_TRACKS: Final = 1000  # largest number of tracks of a label; the oldest ones are dropped
 
 
 class TentativeTracks:
@@ -22,20 +22,21 @@ class TentativeTracks:
 
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings
-        self.points: Array = np.zeros((0, 2))  # (n, 2) weighted mean of a track's detections in m, map frame
-        self.information: Array = np.zeros((0, 2, 2))  # (n, 2, 2) sum of its inverse covariances (1/m^2)
+        self.points: Array = np.zeros((0, 2))  # (n, 2) weighted means of the detections in m, map frame
+        self.information: Array = np.zeros((0, 2, 2))  # (n, 2, 2) sums of the inverse covariances (1/m^2)
         self.counts: IntArray = np.zeros(0, np.intp)  # (n,) number of detections
         self.last_t: Array = np.zeros(0)  # (n,) stamp of the newest detection (s)
 
     def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
+        """Return an independent copy; no attribute is changed in place."""
         return shallow(self)
 
     def add(self, points: Array, covariances: Array, t: float) -> None:
         """Add detections (m, 2) with covariances (m, 2, 2), seen at t (s), to their tracks or to new ones.
 
-        A detection is of the track to which it is nearest, in `merge_radius` or in sigmas, whichever says
-        less: far sightings of one cone are smeared along their rays. Tracks older than `forget_after` go.
+        A detection belongs to the nearest track, by the smaller of its distances in `merge_radius` and in
+        sigmas: far sightings of one cone are smeared along their rays. Tracks older than `forget_after` are
+        dropped.
         """
         self._keep(self.last_t > t - self.settings.forget_after)
         if len(points) == 0:
@@ -48,15 +49,15 @@ class TentativeTracks:
         self._keep(newest_of(self.last_t, MAX_TRACKS))
 
     def confirmed(self) -> IntArray:
-        """Return the indices of the tracks with enough detections."""
+        """Indices of the tracks with enough detections."""
         return np.flatnonzero(self.counts >= self.settings.sightings)
 
     def variances(self, indices: IntArray) -> Array:
-        """Return the variance (k,) of tracks in any direction (m^2): half the trace of their covariance."""
+        """Mean variance (k,) of tracks over all directions (m^2): half the trace of their covariance."""
         return np.asarray(0.5 * np.trace(np.linalg.inv(self.information[indices]), axis1=1, axis2=2))
 
     def sigmas(self, indices: IntArray) -> Array:
-        """Return the standard deviation (k,) of tracks in their worst direction (m)."""
+        """Standard deviation (k,) of tracks in their worst direction (m)."""
         a, b, d = self.information[indices].reshape(-1, 4)[:, [0, 1, 3]].T
         return np.asarray((0.5 * (a + d) - np.hypot(0.5 * (a - d), b)) ** -0.5)
 
@@ -90,10 +91,9 @@ class TentativeTracks:
 def merged_in_turn(
     points: Array, covariances: Array, settings: GrowthSettings
 ) -> tuple[Array, Array, IntArray]:
-    """Return points (n, 2), information (n, 2, 2) and numbers (n,) of detections of cones.
+    """Merge detections (m, 2) with covariances (m, 2, 2) of one label as `TentativeTracks.add` does.
 
-    Detections (m, 2) with covariances (m, 2, 2), of one label, are merged one after another as
-    `TentativeTracks.add` does.
+    Return points (n, 2), information (n, 2, 2) and numbers of detections (n,) of the cones.
     """
     gate = (settings.merge_radius, MERGE_MOST, MERGE_CHI)
     places, information, counts, _ = kernels.merged_in_turn(points, covariances, gate)
@@ -110,7 +110,7 @@ def add_by_label(
 
 
 def newest_of(stamps: Array, most: int) -> BoolArray:
-    """Return which (n,) of the stamps (n,) are among the newest ones, of which there are at most `most`."""
+    """Select the newest of stamps (n,), at most `most` of them."""
     keep = np.ones(len(stamps), bool)
     if len(stamps) > most:
         keep[np.argsort(stamps, kind="stable")[:-most]] = False
@@ -118,7 +118,7 @@ def newest_of(stamps: Array, most: int) -> BoolArray:
 
 
 def nearest_within(points: Array, known: Array, radius: float) -> tuple[IntArray, BoolArray]:
-    """Return the index (m,) of the known point nearest to each point (m, 2), and whether within a radius."""
+    """Return the index (m,) of the nearest known point to each point (m, 2), and whether within a radius."""
     if len(known) == 0:
         return np.zeros(len(points), np.intp), np.zeros(len(points), bool)
     offset = points[:, None, :] - known[None, :, :]

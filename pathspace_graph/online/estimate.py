@@ -1,4 +1,4 @@
-"""What the fixed-lag mapper can be asked: the map, what is ahead, the vehicle's state, and the graph."""
+"""Read-only queries of the fixed-lag mapper: map, track ahead, state of the vehicle, and graph."""
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -28,7 +28,7 @@ from .queries import map_of, outline_of, readings_of, smoothed_at, track_ahead_o
 
 
 class MapperEstimate:
-    """What a fixed-lag mapper can be asked; to ask changes nothing of the estimate."""
+    """Read-only queries of a fixed-lag mapper."""
 
     settings: MapperSettings
     scale: float
@@ -44,26 +44,27 @@ class MapperEstimate:
         return f"{name}({poses},\n    {self.outline()})"
 
     def map(self) -> Map:
-        """Return a copy of the present map, with the joint covariance of each boundary's control points.
+        """Return a copy of the map, with the joint covariance of each boundary's control points.
 
-        An open curve goes on beyond its confirmed end, as `outline` says.
+        An open curve includes the tentative stretch that `outline` describes.
         """
         return scaled(map_of(self.road, self._sigma_size), self.scale)
 
     def outline(self) -> Map:
-        """Return a copy of the present map without covariances, which takes a hundredth of the time.
+        """Return a copy of the map without covariances, in a hundredth of the time of `map`.
 
-        Past `confirmed_until` an open curve is tentative: fitted in each call through cones that were seen
-        less often. A curve that has not begun may consist of a tentative stretch alone.
+        Past `confirmed_until` an open curve is tentative: each call fits it through cones with fewer
+        detections. A boundary without a confirmed curve may consist of a tentative stretch alone.
         """
         return scaled(outline_of(self.road), self.scale)
 
     def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
         """Return the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
 
-        It is fast, for a controller in each cycle. While the loop is open, it goes on beyond the confirmed
-        ends through the cones of `outline`, and says where. While the vehicle is lost on a closed map, it is
-        the road as mapped since then. SettingsError is raised where a length is out of its range.
+        The call is fast enough for a controller in each cycle. While the loop is open, the line continues
+        past the confirmed ends through the cones of `outline`, and says where. While the vehicle is lost on a
+        closed map, the line is the road mapped since then. SettingsError is raised for a length out of its
+        range.
         """
         check_line(distance, step, self.scale)
         new_road = self.phase.new_road if isinstance(self.phase, Lost) else None
@@ -71,17 +72,17 @@ class MapperEstimate:
         return scaled(line, self.scale)
 
     def looked_at(self) -> AbstractContextManager[None]:
-        """Return a context in which the mapper may be asked for anything, and its estimate stays as it is.
+        """Return a context in which no query changes the estimate.
 
-        Without it, `control_points` refreshes the inactive part of an open map, and may move later estimates
-        by millimetres.
+        Outside of it, `control_points` refreshes the inactive part of an open map, which may move later
+        estimates by millimetres.
         """
         return self.road.smoother.variables.looked_at()
 
     def readings(self) -> Readings:
-        """Return the detections of the newest cycle as they were used or gated, with their foot points.
+        """Return the used and gated detections of the newest cycle, with foot points.
 
-        A foot point is that of the last linearization, on the curve as it is now.
+        Parameters of the foot points are of the last linearization, positions of the present curve.
         """
         return scaled(readings_of(self.road), self.scale)
 
@@ -91,23 +92,24 @@ class MapperEstimate:
             return scaled(vehicle_state(self.road.smoother, self._sigma_size), self.scale)
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Return the window as GTSAM factors: projection, spacing, smoothness, odometry, your own and prior.
+        """Return the window as GTSAM factors: projection, gauge, odometry, stations, user factors and prior.
 
-        The factors hold the active variables, which `values` returns. Linearized at the estimate, they are
-        the mapper's own system in GTSAM's tangents of the poses. The graph shares nothing with the mapper:
-        optimize it, print its errors, or compute its marginals with GTSAM's own classes.
+        The factors are on the active variables, which `values` returns. Linearized at the estimate, they give
+        the mapper's own system in GTSAM's tangent space of the poses. The graph shares nothing with the
+        mapper: optimize it, print its errors, or compute its marginals with GTSAM's classes.
         """
         return window_graph(self.road)
 
     def values(self) -> gtsam.Values:
-        """Return the active variables: poses as `Pose2`, control points and the calibration as points."""
+        """Return the active variables: poses as `Pose2`, control points and calibrations as points."""
         return self.road.smoother.variables.gtsam_values(self.road.smoother.layout.keys)
 
     def marginal_covariance(self, keys: Sequence[int]) -> Array:
         """Return the joint covariance (q, q) of any variables (k,), in the order of their keys.
 
-        Control points are in m, poses (x, y, theta) in m and rad, both in the map frame; the calibration is
-        (-, rad/s). SettingsError is raised for a key of a pose outside the window or of former knots.
+        Units are m for control points, m and rad for poses (x, y, theta), both in the map frame, and (-,
+        rad/s) for the calibration. SettingsError is raised for a pose outside the window or a key of former
+        knots.
         """
         wanted, smoother = np.array(keys, np.intp), self.road.smoother
         unknown = wanted[smoother.variables.layout.positions(wanted) == UNKNOWN_PLACE]
@@ -121,16 +123,16 @@ class MapperEstimate:
 
     @staticmethod
     def pose_key(cycle: int) -> int:
-        """Return GTSAM's key of the pose at a perception cycle, counted from 0."""
+        """Return the GTSAM key of the pose at a perception cycle, counted from 0."""
         return pose_key(cycle)
 
     @property
     def next_pose_key(self) -> int:
-        """Return the key of the pose that the next update adds."""
+        """Return the key of the pose of the next update."""
         return pose_key(self.road.next_cycle)
 
     def control_keys(self, label: int) -> list[int]:
-        """Return the keys of a boundary's control points, which change only when the loop closes."""
+        """Return the keys of a boundary's control points; they change only when the map is replaced."""
         keys: list[int] = self.road.smoother.map.state.keys(label).tolist()
         return keys
 
@@ -138,48 +140,48 @@ class MapperEstimate:
 
     @property
     def closed(self) -> bool:
-        """Return whether the loop has closed: the map has its final size."""
+        """Whether the loop has closed."""
         return self.road.closed
 
     @property
     def placed_at(self) -> float | None:
-        """Return the stamp (s) at which the vehicle was found on its known map, if it was."""
+        """Return the stamp (s) of the localization on the known map, if there was one."""
         return self.drive.placed_at
 
     @property
     def corrected_poses(self) -> Array:
-        """Return the poses (k, 3) of the first k cycles as the closing of the loop has corrected them."""
+        """Return the poses (k, 3) of the first k cycles, corrected by loop closure or revisits."""
         return self.drive.record.corrected
 
     def smoothed(self, t: Array) -> Array:
-        """Return the corrected poses (n, 3) of the cycles at stamps (n,); NaN after the last of them."""
+        """Return the corrected poses (n, 3) at stamps t (n,) of cycles; NaN after the last corrected one."""
         poses: Array = times(self.corrected_poses, POSE_LENGTHS, self.scale)
         return smoothed_at(t, np.array([*self.drive.record.stamps][: len(poses)]), poses)
 
     @property
     def revisits(self) -> tuple[Revisit, ...]:
-        """Return the poses measured in the frame of earlier ones, where an open road was driven twice."""
+        """Return the relative poses by which the open map was optimized."""
         return self.drive.revisits
 
     @property
     def closed_by(self) -> tuple[Revisit, ...]:
-        """Return the pose measured in the frame of one of the beginning, by which a batch closed the loop."""
+        """Return the relative pose that started the batch of the loop closure, in a tuple of at most one."""
         return (self.drive.closed_by,) if self.drive.closed_by else ()
 
     @property
     def lap_seconds(self) -> float:
-        """Return the wall time (s) of the batch of the lap, once it has replaced the prior."""
+        """Return the wall time (s) of the batch of the present map; NaN without one."""
         return self.drive.lap_seconds
 
     def wait(self) -> None:
-        """Wait for the batch whose result the next update may take, however long that takes.
+        """Wait without limit for the batch whose result may be due in the next update.
 
-        A replay calls this before each update, so that the same log always gives the same map.
+        A replay calls this before each update, so that a log always gives the same map.
         """
         self.drive.solver.wait(self.road.next_cycle)
 
     def batches(self) -> LapBatches:
-        """Return the cycles in which batches of the lap have ended, and how late they would have been."""
+        """Return the cycles in which batches ended, and how late they would have been in a vehicle."""
         solver = self.drive.solver
         return LapBatches(solver.ends(self.road.next_cycle), solver.late_cycles)
 
@@ -187,7 +189,7 @@ class MapperEstimate:
 
     @property
     def boundaries(self) -> dict[int, Boundary]:
-        """Return the curves by label; their control points are in `control_points`."""
+        """Return the knots and cones of the curves by label; `control_points` has their control points."""
         return self.road.boundaries
 
     def control_points(self, label: int) -> Array:
@@ -197,11 +199,11 @@ class MapperEstimate:
 
     @property
     def poses(self) -> Array:
-        """Return a view of the poses (P, 3) in the window, the oldest first, map frame."""
+        """Return a view of the poses (P, 3) in the window, oldest first, map frame."""
         return self.road.poses
 
     def window_poses(self) -> Array:
-        """Return a copy of the poses (P, 3) in the window, the oldest first, map frame."""
+        """Return a copy of the poses (P, 3) in the window, oldest first, map frame."""
         poses: Array = times(self.poses.copy(), POSE_LENGTHS, self.scale)
         return poses
 
@@ -212,5 +214,5 @@ class MapperEstimate:
 
     @property
     def _sigma_size(self) -> float:
-        """Return the standard deviation of the size of the world, where it is no variable (-)."""
+        """Return the relative standard deviation of the map's size, if it is not estimated (-)."""
         return self.drive.priors.odometry.sigma_size

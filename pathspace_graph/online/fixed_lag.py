@@ -34,7 +34,7 @@ from .estimate import MapperEstimate
 
 @dataclass(frozen=True, eq=False)
 class _Before:
-    """What a cycle changes, as it was before."""
+    """Copy of a mapper's state before a cycle."""
 
     front_end: FrontEnd
     road: Road
@@ -49,30 +49,30 @@ class _Before:
 
 
 class FixedLagMapper(MapperEstimate):
-    """Both boundaries of a track, mapped cycle by cycle as splines in one factor graph with the poses.
+    """Fixed-lag smoother of both boundaries of a track, as splines in one factor graph with the poses.
 
-    Each cycle solves for the poses of the last `settings.lag` seconds and for every control point; all
-    earlier information is a Gaussian prior. `odometry_sigma` (3,) is the standard deviation of one measured
-    twist (m/s, m/s, rad/s).
+    Each cycle solves for the poses of the last `settings.lag` seconds and for every control point. All
+    earlier information is in a Gaussian prior. `odometry_sigma` (3,) is the standard deviation of one
+    measured twist (m/s, m/s, rad/s).
     """
 
-    ROAD: ClassVar = Road  # class of what is estimated
-    FIRST_PHASE: ClassVar = Open  # class of the phase that a drive begins with
+    ROAD: ClassVar = Road  # class of the estimate
+    FIRST_PHASE: ClassVar = Open  # class of the first phase
 
     def __init__(
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
         self.settings = known_settings(settings)
         self.scale = self.settings.scale or 1.0
-        """Size of the scene: a cycle comes in its metres, and so does what is asked for."""
+        """Scale of the scene: cycles and results are in its metres."""
         noise = known_noise(odometry_sigma, self.scale)
-        self.failures = 0  # number of updates that have failed
+        self.failures = 0  # number of failed updates
         self.front_end = FrontEnd(self.settings, noise, self.scale)
         self.road: Road = self.ROAD(self.settings)
         self.drive = Drive(self.settings)
         self.phase: Phase = self.FIRST_PHASE(self.settings)
-        self.health = Health()  # how far the newest estimate can be trusted
-        self._unused: Odometry | None = None  # twists of a cycle that was left out
+        self.health = Health()  # health of the newest estimate
+        self._unused: Odometry | None = None  # twists of a skipped cycle
         if self.settings.open_lap.prior == "window":
             self.drive.record.give_up("no batch of the lap was asked for")
 
@@ -86,12 +86,12 @@ class FixedLagMapper(MapperEstimate):
         start: Array | None = None,
         keep: bool = False,
     ) -> Self:
-        """Return a mapper on a known map, in whose frame all results are once the vehicle is found on it.
+        """Return a mapper on a known map; all results are in its frame once the vehicle is found on it.
 
-        Until then it maps a road of its own. A vehicle may be anywhere on a closed map; it begins near
-        `start` (3,) in m, m and rad, map frame, if that is given. On an open map it must be.
-        The map is refined by what is seen, or held as it is to `keep` it.
-        SettingsError is raised for a map without both curves or without covariances.
+        Until then the mapper maps a road of its own. `start` (3,) in m, m and rad, map frame, is the
+        approximate first pose; it is required on an open map and optional on a closed one. Detections refine
+        the map, unless `keep` fixes it. SettingsError is raised for a map without both curves or without
+        covariances.
         """
         mapper = cls(settings, odometry_sigma)
         known, pose = scaled(track, 1.0 / mapper.scale), None
@@ -110,29 +110,30 @@ class FixedLagMapper(MapperEstimate):
     ) -> CycleResult:
         """Process one perception cycle: the twists since the last cycle, and its detections.
 
-        A cycle that cannot be used (`front_end.gate`, `settings.online`) raises a ReadingError and changes
-        nothing; impossible detections are dropped and counted. Each twist is held until the next one, and
-        those in force before the newest cycle are left out.
+        An unusable cycle (`front_end.gate`, `settings.online`) raises a ReadingError and changes nothing.
+        Impossible detections are dropped and counted. Each twist is held until the next one; twists that end
+        before the newest cycle are left out.
 
-        Where a batch is under way, the call waits for it no longer than the time since the cycle before. A
-        replay of a log calls `wait` first, so that it does not depend on the speed of the machine.
+        The call waits for a running batch no longer than the time since the previous cycle. A replay calls
+        `wait` first, so that the map does not depend on the speed of the machine.
 
         `factors` are GTSAM factors of your own, at scale 1, on poses in the window (`pose_key`,
         `next_pose_key`: `Pose2`), on control points (`control_keys`: `Point2`) and on the calibration. Each
         is relinearized at every step until one of its poses leaves the window; then it is part of the prior.
-        The batch of the lap has those on poses as well, as they are linearized in this cycle; one on control
-        points leaves no batch, and is kept until the loop closes. SettingsError is raised, and nothing is
-        changed, if a key is not a variable of the graph or a number not finite.
+        The batch of the lap includes factors on poses, linearized in this cycle. A factor on control points
+        prevents the batch and is kept until the loop closes. A factor without information is left out.
+        SettingsError is raised, and nothing changes, if a key is not a variable of the graph or a number is
+        not finite.
 
-        Nothing else is raised, unless `strict`: where a step fails, the mapper goes back to before the cycle
-        and takes it again with less, as the notice says, and `failures` counts.
+        No other error is raised, unless `strict`: if a step fails, the mapper restores its state before the
+        cycle and retries with less, as the notice says, and `failures` counts.
         """
         factors = tuple(factors)
         cycle = self._admit(odometry, detections, factors)
         before = _Before.of(self)
         try:
             result = self._process(cycle, factors)
-        except Exception as error:  # a vehicle drives on, whatever has failed
+        except Exception as error:  # the vehicle drives on, whatever fails
             if strict:
                 self._go_back(before)
                 raise
@@ -142,8 +143,9 @@ class FixedLagMapper(MapperEstimate):
         return cycle.counted(result)
 
     def _process(self, cycle: Admitted, factors: Sequence[gtsam.NonlinearFactor]) -> CycleResult:
-        """Take the steps of the paper, and that of the phase."""
+        """Run the steps of the paper, and the step of the phase."""
         watch, road, drive = Stopwatch(), self.road, self.drive
+        factors = road.smoother.informative(factors)
         held = road.add_factors(factors)
         reading = self.front_end.update(cycle.odometry, cycle.detections)
         road.predict(reading.motion, reading.orange)
@@ -169,9 +171,9 @@ class FixedLagMapper(MapperEstimate):
     def _without(
         self, before: _Before, cycle: Admitted, factors: Sequence[gtsam.NonlinearFactor], error: Exception
     ) -> CycleResult:
-        """Go on where a cycle has failed: with the road alone, or without detections, or without the cycle.
+        """Retry a failed cycle with the road alone, then without detections; otherwise skip the cycle.
 
-        The mapper is as it was before the cycle each time. The notice says what has failed.
+        Each attempt starts from the state before the cycle. The notice says what failed.
         """
         self.failures += 1
         why = f": {type(error).__name__}: {error}" if self.failures == 1 else f" (failure {self.failures})"
@@ -192,7 +194,7 @@ class FixedLagMapper(MapperEstimate):
         return self._result(cycle.detections.t, {}, None, f"{failed}; the cycle is not used")
 
     def _go_back(self, before: _Before) -> None:
-        """Take a cycle back; what was before stays, for another failure."""
+        """Restore the state before a cycle; `before` can be used again."""
         self.front_end, self.road = before.front_end.copy(), before.road.copy()
         self.drive, self.phase = before.drive.copy(), before.phase.copy()
         self.health = before.health
@@ -209,9 +211,9 @@ class FixedLagMapper(MapperEstimate):
         return cycle if unused is None else replace(cycle, odometry=unused.followed_by(cycle.odometry))
 
     def finish(self) -> None:
-        """Take the result of a batch that is under way, where the drive is over and no cycle follows.
+        """Wait for a running batch and use its result, after the last cycle of a drive.
 
-        A lap that was recognized in the last metres of a drive closes only then.
+        A return in the last metres of a drive closes the loop only here.
         """
         outcome = self.drive.solver.last_outcome(self.road.next_cycle - 1)
         if outcome is not None:
@@ -227,14 +229,14 @@ class FixedLagMapper(MapperEstimate):
     # --- the snapshot ------------------------------------------------------------------------------------
 
     def noise_used(self) -> RunNoise:
-        """Return the noise that is used now, and what was measured so far."""
+        """Return the noise in use, and the newest measurement."""
         return scaled(self.front_end.noise_used, self.scale)
 
     def save(self, path: Path | str) -> None:
-        """Write the whole mapper to one file, from which `restore` makes one that goes on to the same map.
+        """Write the mapper to one file, from which `restore` continues to the same map.
 
-        Nothing of the mapper changes. An earlier file is kept as a numbered backup, and at each moment the
-        old or the new file is there. SettingsError is raised while a factor of your own is in the window.
+        An existing file becomes a numbered backup, and the write is atomic. SettingsError is raised while a
+        factor of your own is in the window.
         """
         count = self.road.smoother.user_factors.count
         if count:
@@ -243,15 +245,15 @@ class FixedLagMapper(MapperEstimate):
 
     @classmethod
     def restore(cls, path: Path | str) -> Self:
-        """Return the mapper that `save` has written, with its settings; an InputError if the file is not so.
+        """Return the mapper written by `save`, with its settings; InputError for any other file.
 
-        A lap that was being solved when it was saved is solved again.
+        A batch that was running is solved again.
         """
-        mapper = restore(path, cls, FixedLagMapper._look)
+        mapper = restore(path, cls, FixedLagMapper._query)
         mapper.drive.resume()
         return mapper
 
-    def _look(self) -> None:
+    def _query(self) -> None:
         self.outline()
         if self.road.smoother.times:
             self.vehicle_state()

@@ -17,10 +17,7 @@ from pathspace_graph.spline.boundary import Boundary
 
 
 def window_graph(road: Road) -> gtsam.NonlinearFactorGraph:
-    """Return the factors of a road on its active variables; it shares nothing with the road.
-
-    Linearized at the estimate, they are the system of the next step in GTSAM's tangents of the poses.
-    """
+    """Return the factors of a road on its active variables, as in `MapperEstimate.graph`."""
     smoother, track, settings = road.smoother, road.smoother.map, road.settings
     factors: list[gtsam.NonlinearFactor] = []
     anchor = gtsam.noiseModel.Isotropic.Sigma(2, settings.gauge.sigma_anchor)
@@ -44,9 +41,9 @@ def window_graph(road: Road) -> gtsam.NonlinearFactorGraph:
 
 
 def _detection_factors(track: CurveMap, label: int, active: IntArray) -> list[gtsam.CustomFactor]:
-    """Return a spline-projection factor for each cycle of the detections in use on a boundary.
+    """Return a spline-projection factor for each cycle with detections in use on a boundary.
 
-    Foot points may move as far as a step refines them, where the curve is active.
+    Foot points may move as far as in a step, within the active part of the curve.
     """
     detections, settings = track.detections, track.settings
     boundary, rows = track.state.boundaries[label], detections.used_on(label)
@@ -68,7 +65,7 @@ def _detection_factors(track: CurveMap, label: int, active: IntArray) -> list[gt
 
 
 def _station_factors(track: CurveMap, label: int) -> list[gtsam.CustomFactor]:
-    """Return a factor for each cycle of the detections on a boundary that have a station."""
+    """Return a station factor for each cycle with such detections on a boundary."""
     detections, stations = track.detections, track.stations
     rows = detections.used_on(label)
     rows = rows[detections.station[rows] != NO_STATION]
@@ -90,7 +87,7 @@ def _station_factors(track: CurveMap, label: int) -> list[gtsam.CustomFactor]:
 
 
 def _room(boundary: Boundary, active: IntArray, u: Array, room: float) -> tuple[Array, Array]:
-    """Return how far before and past parameters (m,) the curve is active, at most `room`."""
+    """Return the lengths (m,) of active curve before and past parameters u (m,), at most `room` (m)."""
     if len(active) == boundary.size:
         return np.full(len(u), room), np.full(len(u), room)
     p, begin = boundary.degree, boundary.knots[active[0] + boundary.degree]

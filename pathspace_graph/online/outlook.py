@@ -1,6 +1,6 @@
-"""The outlook: the open curves as they lead on, through tentative tracks beyond their confirmed ends.
+"""The outlook: open curves extended through tentative tracks past their confirmed ends.
 
-The tentative stretch is no part of the graph: it is fitted anew whenever the map is asked for.
+The tentative stretch is not in the graph: each query of the map fits it again.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,16 +24,16 @@ from pathspace_graph.spline.ahead import CurveAhead
 from pathspace_graph.spline.boundary import Boundary, Placement, open_boundary
 from pathspace_graph.spline.bspline import BSpline
 
-TENTATIVE_REACH: Final = 12.5  # farthest track from the vehicle that the stretch leads through (m)
+TENTATIVE_REACH: Final = 12.5  # largest distance of a track from the vehicle (m)
 UNCONFIRMED_MEMORY: Final = 0.35
-"""Time for which an unconfirmed track counts (s): a detection of nothing is not repeated."""
-TAIL: Final = 20.0  # length of the confirmed curves that tells where the track leads and how wide it is (m)
+"""Time for which an unconfirmed track is used (s): clutter is not detected again."""
+TAIL: Final = 20.0  # length of the confirmed curve that gives direction and width of the track (m)
 TAIL_STEP: Final = 1.0  # step of the points along that length (m)
-BEGIN_LATERAL: Final = 1.5  # distance beside the vehicle at which a row without a curve is searched (m)
-SIGMA_TRACK: Final = 0.1  # of a cone's distance from a smooth curve (m), added to a track's own
+BEGIN_LATERAL: Final = 1.5  # distance beside the vehicle at which a row without a curve begins (m)
+SIGMA_TRACK: Final = 0.1  # standard deviation of cones about a smooth curve, added to a track's own (m)
 SIGMA_BEND: Final = 1.0
-"""Standard deviation of the second difference of control points about that of a straight line (m). It widens
-the band between tracks that are far apart, and beyond the last one."""
+"""Standard deviation of the second differences of control points (m). It widens the uncertainty between
+distant tracks and past the last one."""
 MIN_TRACKS: Final = 2  # least number of tracks for a tentative curve of a boundary that has not begun
 
 
@@ -41,12 +41,12 @@ MIN_TRACKS: Final = 2  # least number of tracks for a tentative curve of a bound
 class Outlook:
     """A boundary with its tentative stretch."""
 
-    boundary: Boundary  # knots, those of the tentative stretch too
+    boundary: Boundary  # knots, including the tentative stretch
     known: Array  # (n, 2) control points of the confirmed curve (m, map frame)
     confirmed_until: float  # parameter up to which the curve is confirmed (m)
-    tracks: Array  # (k, 2) tracks that the tentative stretch leads through (m, map frame)
-    variances: Array  # (k,) variance of each in any direction (m^2), seen from the vehicle
-    placement: Placement | None  # of control points for the tentative stretch, if there is one
+    tracks: Array  # (k, 2) tracks on the tentative stretch (m, map frame)
+    variances: Array  # (k,) their variances per coordinate, relative to the vehicle (m^2)
+    placement: Placement | None  # placement of the control points of the tentative stretch
 
     @property
     def control_points(self) -> Array:
@@ -65,8 +65,8 @@ def joint_covariance_of(
 ) -> tuple[Array, list[slice]]:
     """Return the joint covariance of the control points of all curves, and the block of each curve.
 
-    `joint` is that of the known control points and, last, of the pose `vehicle` (3,) from which the tracks
-    were seen. The placement is linear in both, in the tracks' errors, and in the second differences.
+    `joint` is the covariance of the known control points and, last, of the pose `vehicle` (3,) that has seen
+    the tracks. The placement is linear in both, in the tracks' errors, and in the second differences.
     """
     changes, noises, blocks, begin, end, eye = [], [], [], 0, 0, np.eye(POINT)
     for outlook in outlooks:
@@ -91,7 +91,7 @@ def joint_covariance_of(
 
 
 def _by_pose(points: Array, vehicle: Array) -> Array:
-    """Return the derivative (2k, 3) of points (k, 2), fixed to the vehicle, by its pose (x, y, theta)."""
+    """Return the derivative (2k, 3) of points (k, 2) fixed to the vehicle by its pose (x, y, theta)."""
     offset = points - vehicle[:2]
     jacobian = np.zeros((len(points), POINT, POSE))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
@@ -102,9 +102,9 @@ def _by_pose(points: Array, vehicle: Array) -> Array:
 def curves_ahead(
     track: CurveMap, tentative: Mapping[int, TentativeTracks], path: DrivenPath, t: float
 ) -> dict[int, CurveAhead]:
-    """Return each open curve from beside the vehicle on, with the tracks that lead on, for `track_ahead`.
+    """Return each open curve from the vehicle on, with the tracks past its end, for `track_ahead`.
 
-    These are the tracks of `look_ahead`, but no curve is fitted to them, which would take most of the time.
+    The tracks are those of `look_ahead`. No curve is fitted to them, which would take most of the time.
     """
     state, curves = track.state, {}
     for label, (row, chosen) in extended_rows(track, tentative, path, t).items():
@@ -123,7 +123,7 @@ def curves_ahead(
 def look_ahead(
     track: CurveMap, tentative: Mapping[int, TentativeTracks], path: DrivenPath, t: float
 ) -> dict[int, Outlook]:
-    """Return each open curve with its tentative stretch at t (s), and curves that have not begun but may."""
+    """Return each open curve with its tentative stretch at t (s), and curves with only such a stretch."""
     state, outlooks = track.state, {}
     for label, (row, chosen) in extended_rows(track, tentative, path, t).items():
         variances = tentative[label].variances(chosen) + SIGMA_TRACK**2
@@ -138,7 +138,7 @@ def look_ahead(
 
 
 def confirmed(track: CurveMap) -> dict[int, Outlook]:
-    """Return the curves as they are, without a tentative stretch."""
+    """Return the curves without a tentative stretch."""
     state, none = track.state, np.zeros((0, POINT))
     return {
         label: Outlook(boundary, state.control_points(label), boundary.confirmed_end, none, np.zeros(0), None)
@@ -149,7 +149,7 @@ def confirmed(track: CurveMap) -> dict[int, Outlook]:
 def extended_rows(
     track: CurveMap, tentative: Mapping[int, TentativeTracks], path: DrivenPath, t: float
 ) -> dict[int, tuple[ConeRow, IntArray]]:
-    """Return the row of each boundary, extended through its tentative tracks, and the indices of these."""
+    """Extend the row of each boundary through its tentative tracks; return it with their indices."""
     tracks = {label: _tracks(track, label, tentative[label], t) for label in BOUNDARIES}
     rows = {label: _row(track, label, tentative[label].points[tracks[label]]) for label in BOUNDARIES}
     driven = newest(path.ahead(track.state.poses[-1], 0.0)).points
@@ -158,9 +158,9 @@ def extended_rows(
 
 
 def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> IntArray:
-    """Return the indices of the tracks near the vehicle that are confirmed or were seen just now.
+    """Return the indices of tracks near the vehicle that are confirmed or were just seen.
 
-    Tracks at the curve are left out: across an infield the sensor sees an earlier stretch again.
+    Tracks on the curve are left out: the sensor may see an earlier stretch across the infield.
     """
     settings, state = track.settings.growth, track.state
     near = np.hypot(*(tracks.points - state.poses[-1, :2]).T) < TENTATIVE_REACH
@@ -176,7 +176,7 @@ def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> I
 
 
 def _row(track: CurveMap, label: int, candidates: Array) -> ConeRow:
-    """Return a boundary's row with its candidates; it begins beside the vehicle if there is no curve yet."""
+    """Return a boundary's row with its candidates; without a curve it begins beside the vehicle."""
     state, side = track.state, SIDES[label]
     if label not in state.boundaries:
         x, y, theta = state.poses[-1]
@@ -192,7 +192,7 @@ def _row(track: CurveMap, label: int, candidates: Array) -> ConeRow:
 
 
 def _begun(settings: MapperSettings, row: ConeRow, variances: Array) -> Outlook:
-    """Return a curve through the tracks of a row; none of it is confirmed."""
+    """Fit an unconfirmed curve through the tracks of a row."""
     boundary, u = open_boundary(settings.spline, settings.gauge), row.lengths
     placement = boundary.extend(0, u - u[0])
     return Outlook(boundary, np.zeros((0, POINT)), 0.0, row.cones, variances, placement)

@@ -1,4 +1,4 @@
-"""What can be asked of a road: its map, the track ahead, the newest readings. To ask changes nothing."""
+"""Read-only queries of a road: map, track ahead, newest readings."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -19,8 +19,8 @@ from .outlook import Outlook, confirmed, curves_ahead, joint_covariance_of, look
 def map_of(road: Road, sigma_size: float) -> Map:
     """Return the map with the joint covariance of each boundary's control points, and the orange cones.
 
-    `sigma_size` is the standard deviation of the size of the world (-). A closed curve with few control
-    points has the scatter of the cones about it added.
+    `sigma_size` is the relative standard deviation of the map's size. The covariance of a closed curve
+    includes the scatter of the cones about it.
     """
     with road.smoother.variables.looked_at():
         return replace(_map_of(road, sigma_size), points=road.orange.points())
@@ -51,7 +51,7 @@ def _map_of(road: Road, sigma_size: float) -> Map:
 
 
 def outline_of(road: Road) -> Map:
-    """Return the map without covariances, which takes a hundredth of the time."""
+    """Return the map without covariances, in a hundredth of the time of `map_of`."""
     with road.smoother.variables.looked_at():
         boundaries = {
             label: SplineBoundary(outlook.spline, NO_COVARIANCE, outlook.confirmed_until)
@@ -83,10 +83,7 @@ def track_ahead_of(road: Road, distance: float, step: float) -> TrackAhead:
 
 
 def readings_of(road: Road) -> Readings:
-    """Return the detections of the newest cycle as they were used or gated, with their foot points.
-
-    A foot point is that of the last linearization, on the curve as it is now.
-    """
+    """Return the used and gated detections of the newest cycle, as in `MapperEstimate.readings`."""
     track, table = road.smoother.map, road.smoother.map.detections
     newest = slice(int(table.cycle.searchsorted(road.next_cycle - 1)), None)
     used, boundary = table.used[newest].copy(), table.boundary[newest].copy()
@@ -100,7 +97,7 @@ def readings_of(road: Road) -> Readings:
 
 
 def smoothed_at(t: Array, stamps: Array, poses: Array) -> Array:
-    """Return the corrected poses (k, 3) of cycles with stamps (k,) at t (n,); NaN after the last of them."""
+    """Return the poses (n, 3) at t (n,) among poses (k, 3) at stamps (k,) of cycles; NaN past the last."""
     found, known = np.full((len(t), POSE), np.nan), t <= stamps.max(initial=-np.inf)
     found[known] = poses[np.maximum(stamps.searchsorted(t[known], side="right") - 1, 0)]
     return found

@@ -1,4 +1,4 @@
-"""A hint: what is odd about a log, where it is, its likely cause, and what to do; and the table of them."""
+"""Hints about likely mistakes in a log, and the table of their texts."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from pathspace_graph.lengths import Text
 
 @dataclass(frozen=True)
 class Hint:
-    """A likely mistake in a log, in words whose lengths change with the scale of the scene."""
+    """A likely mistake in a log; lengths in its texts are in metres of the scene."""
 
     LENGTHS: ClassVar = dict.fromkeys(("cause", "file", "columns", "found", "likely", "advice"), 0)
 
@@ -18,12 +18,13 @@ class Hint:
     """Kind of the mistake."""
     file: str
     columns: str
-    """Columns of the file, in words."""
+    """Columns of the file."""
     found: str
-    """What was found, with its figure."""
+    """Finding, with its figure."""
     likely: str
     """Likely cause."""
     advice: str
+    """Correction."""
 
     @property
     def line(self) -> str:
@@ -31,7 +32,7 @@ class Hint:
 
 
 def because(hints: Sequence[Hint]) -> str:
-    """Return the likely causes of a refusal in words, or nothing where there is no hint."""
+    """Return the likely causes of a refusal in words; empty without hints."""
     causes = [f"{hint.likely} ({hint.file}, {hint.columns}: {hint.found})" for hint in hints]
     return f"likely cause: {'; '.join(causes)}" if causes else ""
 
@@ -39,16 +40,16 @@ def because(hints: Sequence[Hint]) -> str:
 _T, _XY, _V, _WZ, _K = "column t", "columns x, y", "columns vx, vy", "column wz", "columns xx, xy, yy"
 _LABEL = "column label"
 _EXPECTED = (
-    "{as_written:.0f} % of the detections lie where the odometry expects them, and {share:.0f} % if it is so"
+    "the odometry predicts {as_written:.0f} % of the detections, and {share:.0f} % with the likely cause"
 )
-_MOVES_TURNED = "static cones move as they would for a sensor that is turned by {angle}"
-_BY_READINGS = "--noise measured takes what is measured"
-_CUT = "check that the record has all of the detections; convert with"
+_MOVES_TURNED = "static cones move as if the sensor were turned by {angle}"
+_BY_READINGS = "--noise measured uses the measured one"
+_CUT = "check that the recording has all detections; convert with"
 _CLASSES = "the classes of the detector were not turned into left and right"
 
-# cause, file, columns, figure, likely cause and advice of each mistake, with places for its numbers
+# kind, file, columns, finding, likely cause and advice of each mistake, with places for its figures
 TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
-    "unit of stamps": ("stamps", "{file}", _T, "rows follow each other after {step:.4g} s as a rule",
+    "unit of stamps": ("stamps", "{file}", _T, "successive rows are typically {step:.4g} s apart",
         "the stamps are in {unit}, not in seconds", "multiply column t by {factor:g}"),
     "fraction of seconds": ("stamps", "{file}", _T,
         "the stamps fall {falls} times and stay between {low:.4g} and {high:.4g}",
@@ -67,11 +68,11 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
         "stamp odometry and detections when they are measured, by one clock"),
     "detections end early": ("gaps", DETECTIONS_FILE, _T,
         "the last detection is {seconds:.3g} s before the last odometry",
-        "the detector or its record stopped before the drive ended", _CUT + " --end leaves the rest out"),
+        "the detector or its recording stopped before the drive ended", _CUT + " --end leaves the rest out"),
     "detections begin late": ("gaps", DETECTIONS_FILE, _T,
         "the first detection is {seconds:.3g} s after the first odometry",
-        "the detector or its record started after the drive began", _CUT + " --start leaves the rest out"),
-    "unit of positions": ("positions", DETECTIONS_FILE, _XY, "detections are {typical:.4g} m away as a rule",
+        "the detector or its recording started after the drive began", _CUT + " --start leaves the rest out"),
+    "unit of positions": ("positions", DETECTIONS_FILE, _XY, "detections are typically {typical:.4g} m away",
         "the positions {what}", "multiply x and y by {factor:g}"),
     "too fast": ("speeds", ODOMETRY_FILE, _V, "the speed is more than {speed:.4g} m/s in a tenth of the rows",
         "the speeds are not in m/s, but in mm/s or cm/s", "give them in m/s"),
@@ -86,7 +87,7 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
         "the odometry is a pose (x, y, heading), not a twist", "give the body twist"),
     "twist in the map frame": ("odometry", ODOMETRY_FILE, _V, _EXPECTED,
         "vx and vy are along the axes of a fixed frame, not of the vehicle",
-        "turn them by the heading into the vehicle's frame"),
+        "rotate them by the heading into the vehicle's frame"),
     "nothing": ("map frame", DETECTIONS_FILE, _XY, _EXPECTED,
         "the detections are in the frame of the map, or the vehicle stood while its wheels turned",
         "give the detections in the vehicle's frame"),
@@ -97,23 +98,23 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
     "y to the right": ("y to the right", DETECTIONS_FILE, "column y", _EXPECTED,
         "y points to the right in the detections, not to the left", "negate column y"),
     "yaw rate to the right": ("yaw rate", ODOMETRY_FILE, _WZ, _EXPECTED,
-        "the yaw rate is positive to the right, as where z points down, or y points to the right",
+        "the yaw rate is positive to the right, as with z down, or y points to the right",
         "negate column wz, or column y of the detections"),
     "frame": ("sensor frame", DETECTIONS_FILE, _XY, _EXPECTED, "{what}", "{how}"),
     "camera": ("sensor frame", DETECTIONS_FILE, _XY,
-        "column {thin} varies by {least:.2g} m only, the other one by {most:.2g} m",
+        "column {thin} varies by only {least:.2g} m, the other one by {most:.2g} m",
         "the detections are in the frame of a camera, with z ahead, x to the right and y down",
         "put z into column x and -x into column y"),
     "turned": ("sensor frame", DETECTIONS_FILE, _XY, _MOVES_TURNED,
         "the sensor is turned by {angle} in the vehicle{side}",
-        "state the sensor's mounting, or turn the detections by that into the vehicle's frame"),
+        "state the sensor's mounting, or rotate the detections by it into the vehicle's frame"),
     "place": ("mounting", DETECTIONS_FILE, _XY,
-        "static cones move as they would for a sensor {along:.2f} m {ahead_or_behind} and {aside:.2f} m to "
-        "the {left_or_right} of the point that the odometry describes",
+        "static cones move as if the sensor were {along:.2f} m {ahead_or_behind} and {aside:.2f} m to the "
+        "{left_or_right} of the odometry's reference point",
         "the detections are in the sensor's frame, whose origin is not the vehicle's",
         "add {ahead:.2f} to x and {left:.2f} to y, or state the sensor's mounting"),
     "covariances": ("covariances", DETECTIONS_FILE, _K,
-        "detections of one cone are {scatter:.2g} m apart as a rule, by their covariances {claimed:.2g} m",
+        "detections of one cone are typically {scatter:.2g} m apart, or {claimed:.2g} m by their covariances",
         "the covariances are in {unit}, or no covariances at all", "give each detection's covariance in m^2"),
     "one label": ("labels", DETECTIONS_FILE, _LABEL,
         "all labels are {label}, and {share:.0f} % of the cones are on that side", _CLASSES,
@@ -121,17 +122,17 @@ TABLE: Final[dict[str, tuple[str, str, str, str, str, str]]] = {
     "foreign labels": ("labels", DETECTIONS_FILE, _LABEL, "the labels are {words}", _CLASSES,
         "write left, right or unknown (or blue, yellow) for each detection"),
     "unexplained": ("unexplained", DETECTIONS_FILE, _XY,
-        "only {share:.0f} % of the detections lie where any motion expects them",
-        "bearings in degrees were taken for radians, or the two files are not of one drive",
-        "compare a few cycles with what the sensor saw"),
+        "no motion predicts more than {share:.0f} % of the detections",
+        "bearings in degrees were taken for radians, or the two files are of different drives",
+        "compare a few cycles with the sensor's raw data"),
     "noise of odometry": ("noise", LOG_FILE, "[odometry] sigma", "{figures}",
         "the stated noise is too {size}", _BY_READINGS),
     "noise of detections": ("noise", DETECTIONS_FILE, _K,
-        "detections scatter by {scatter:.2g} m {way} the ray at {at:.2g} m, where {stated:.2g} m is stated",
+        "detections scatter by {scatter:.2g} m {way} the ray at {at:.2g} m, and {stated:.2g} m is stated",
         "the covariances are too {size}", _BY_READINGS),
 }  # fmt: skip
 
 
-def told(mistake: str, **figures: Any) -> Hint:
-    """Return the hint of a row of `TABLE`, filled in; a figure in m or m/s is a `Length`."""
+def hint_of(mistake: str, **figures: Any) -> Hint:
+    """Return a hint of `TABLE` with its figures; one in m or m/s is a `Length`."""
     return Hint(*(Text(text, **figures) for text in TABLE[mistake]))

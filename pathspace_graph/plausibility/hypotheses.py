@@ -1,6 +1,7 @@
-"""Hypotheses about a log: in which frame its detections are, and what its odometry means.
+"""Hypotheses about a log: the frame of its detections, and the meaning of its odometry.
 
-Cones stand still, so the one that lays most detections of nearby cycles on each other is the likely truth.
+Cones are static, so the likeliest hypothesis is the one under which most detections of nearby cycles
+coincide.
 """
 
 from collections.abc import Iterator, Sequence
@@ -9,7 +10,7 @@ from functools import cached_property
 from typing import Final, Literal, Self
 
 import numpy as np
-import scipy  # which imports its modules when they are used
+import scipy  # imports its modules lazily
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.odometry import integrate_poses
@@ -19,20 +20,20 @@ from pathspace_graph.labels import LEFT, UNKNOWN
 
 # --- pairs of cycles -------------------------------------------------------------------------------------
 
-LEAST_COMPARED: Final = 2  # least number of detections of a cycle that is compared
-MOST_COMPARED: Final = 14  # most detections of a cycle that are compared, the nearest ones
-SOME_CYCLES: Final = 200  # approximate number of cycles from which the spacing of the cones is told
-PAIR_GAPS: Final = (1, 2, 4, 8)  # numbers of cycles between the two that are compared
-PAIRS_OF_GAP: Final = 60  # approximate number of pairs of cycles that are compared for each of the gaps
-LONGEST_PAIR: Final = 1.3  # longest time between the cycles of a pair (s), if cycles do not come more rarely
-EXPLAINED_REACH: Final = 0.2  # distance that counts as the same by `exp(-1/2)`, over the cones' spacing
-VIEW_QUANTILE: Final = 0.95  # share of the detections in the range, and in the bearings, that a cycle sees
-ROUND_VIEW: Final = 0.1  # length of the mean direction to the detections below which a sensor sees all around
+LEAST_COMPARED: Final = 2  # least number of detections of a compared cycle
+MOST_COMPARED: Final = 14  # largest number of compared detections of a cycle, the nearest ones
+SOME_CYCLES: Final = 200  # approximate number of cycles in the spacing of the cones
+PAIR_GAPS: Final = (1, 2, 4, 8)  # steps in cycles between the two of a pair
+PAIRS_OF_GAP: Final = 60  # approximate number of pairs for each step
+LONGEST_PAIR: Final = 1.3  # longest time between the cycles of a pair (s), unless cycles are rarer
+EXPLAINED_REACH: Final = 0.2  # distance with a weight of `exp(-1/2)`, over the spacing of the cones
+VIEW_QUANTILE: Final = 0.95  # quantile of ranges and bearings that bounds the view of a cycle
+ROUND_VIEW: Final = 0.1  # length of the mean direction to detections below which the view is all around
 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs of cycles, whose detections are in the frame of the log; what is not there is NaN."""
+    """Pairs of cycles; detections are in the frame of the log, padded with NaN."""
 
     begin: Array  # stamps (P,) of the earlier cycles (s)
     end: Array  # stamps (P,) of the later cycles (s)
@@ -40,15 +41,16 @@ class Pairs:
     after: Array  # detections (P, m, 2) of the later cycles (m)
     variances: Array  # variances (P, m, m) of one coordinate of each difference of two detections (m^2)
     gap: IntArray  # number (P,) of cycles from the earlier to the later one
-    reach: float  # a detection explains another one at distance d with the weight `exp(-d^2 / 2 reach^2)`
+    reach: float  # scale of the weight `exp(-d^2 / 2 reach^2)` of two detections at distance d (m)
 
     def __len__(self) -> int:
         return len(self.begin)
 
     def distances(self, frame: Array, motion: Array) -> Array:
-        """Return the squared distances (m, m, P) of earlier from later detections, infinite without any.
+        """Return the squared distances (m, m, P) of earlier from later detections; infinite for padding.
 
-        frame (2, 2) leads from the log's frame to the vehicle's, motion (P, 3) from the later to the earlier.
+        `frame` (2, 2) rotates from the log's frame to the vehicle's. `motion` (P, 3) is the later pose in the
+        earlier vehicle frame.
         """
         before, after = self.before @ frame.T, self.laid(frame, motion)
         # the pairs last, and contiguous, as there are far more of them than detections in a cycle
@@ -62,7 +64,7 @@ class Pairs:
         return np.asarray((self.after @ frame.T) @ turn + motion[:, None, :2])
 
     def explained(self, frame: Array, motion: Array) -> Array:
-        """Return the share (P,) of the detections of both cycles that lie on one of the other cycle."""
+        """Return the weighted share (P,) of detections that coincide with one of the other cycle."""
         square = self.distances(frame, motion)
         nearest = np.concatenate([square.min(axis=0), square.min(axis=1)])
         weights = np.exp(nearest / (-2.0 * self.reach**2))
@@ -73,7 +75,7 @@ class Pairs:
         return replace(self, **arrays)
 
     def overlap(self, motion: Array) -> Array:
-        """Return the share (P,) of the later detections that the earlier cycle could have seen."""
+        """Return the share (P,) of the later detections that are in view of the earlier cycle."""
         seen, again = (points @ [1.0, 1j] for points in (self.before, self.laid(np.eye(2), motion)))
         vector = np.nanmean(np.exp(1j * np.angle(seen)))
         back = vector.conjugate() if abs(vector) > ROUND_VIEW else 1.0  # turns the middle of the view ahead
@@ -89,7 +91,7 @@ class Pairs:
 
 
 def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
-    """Return pairs of cycles spread over a log, or None where there are none with detections."""
+    """Return pairs of cycles spread over a log, or None without such pairs."""
     full = [cycle for cycle in cycles if len(cycle.labels) >= LEAST_COMPARED]
     spacing = spacing_of(full[:: max(1, len(full) // SOME_CYCLES)])
     if spacing is None or len(full) < 2:
@@ -111,7 +113,7 @@ def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
 
 
 def _padded(cycles: Sequence[Detections]) -> tuple[Array, Array]:
-    """Return the nearest detections (C, m, 2) of each cycle, and a coordinate's variances (C, m), or NaN."""
+    """Return the nearest detections (C, m, 2) of each cycle and their variances (C, m), padded with NaN."""
     variances = np.full((len(cycles), MOST_COMPARED), np.nan)
     points = np.stack([variances, variances], axis=2)
     for k, cycle in enumerate(cycles):
@@ -122,7 +124,7 @@ def _padded(cycles: Sequence[Detections]) -> tuple[Array, Array]:
 
 
 def spacing_of(cycles: Sequence[Detections]) -> float | None:
-    """Return the median distance from a detection to the next one of its cycle, or None without any."""
+    """Return the median distance from a detection to the nearest one of its cycle, or None without any."""
     found = []
     for cycle in cycles:
         off = cycle.points_vehicle[:, None] - cycle.points_vehicle  # which may be infinite
@@ -133,39 +135,39 @@ def spacing_of(cycles: Sequence[Detections]) -> float | None:
 
 
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:
-    """Return the motions (P, 3) between stamps (P,), in the frame of their beginning, among poses (N, 3)."""
+    """Interpolate poses (N, 3) at stamps (P,); return the motions (P, 3) from `begin` to `end`."""
     first, last = (np.column_stack([np.interp(t, odometry_t, one) for one in poses.T]) for t in (begin, end))
     return np.column_stack([to_vehicle(last[:, :2], first), last[:, 2] - first[:, 2]])
 
 
-# --- what the columns may mean ---------------------------------------------------------------------------
+# --- meanings of the columns -----------------------------------------------------------------------------
 
-TURN_STEP: Final = 15.0  # step of the angles that the frame of the detections is tried at (degrees)
+TURN_STEP: Final = 15.0  # step of the candidate angles of the detections' frame (degrees)
 EQUAL_SHARES: Final = 0.02  # difference of explained shares below which hypotheses are equally good
-SIDED_BETTER: Final = 0.2  # further share of labels on their side by which one of equal hypotheses is better
-TELLING_PAIR: Final = 0.2  # difference of explained shares from which a pair tells two hypotheses apart
-WON_BY_CHANCE: Final = 1e-8  # probability of winning by chance below which a hypothesis is believed
-FAR_BETTER: Final = 1.8  # least ratio of what it explains to what the log as written does
-LEAST_EXPLAINED: Final = 0.3  # least share of the detections that a believed hypothesis explains
-MOUNTING_STEPS: Final = 5  # Gauss-Newton steps that find the mounting of the sensor
-LEAST_MATCHES: Final = 60  # least number of matched detections from which the mounting is found
-WORST_CONDITION: Final = 1e6  # largest condition number at which the mounting is found
-LATEST_STAMPS: Final = 10.0  # largest delay or lead of detections that is tried (s)
-LATE_STEP: Final = 0.25  # step of these (s)
-DEGREE: Final = float(np.pi / 180.0)  # in radians
+SIDED_BETTER: Final = 0.2  # difference of label shares that decides between equally good hypotheses
+TELLING_PAIR: Final = 0.2  # difference of explained shares from which a pair discriminates two hypotheses
+WON_BY_CHANCE: Final = 1e-8  # largest p-value of an accepted hypothesis (sign test)
+FAR_BETTER: Final = 1.8  # least ratio of its explained share to that of the log as written
+LEAST_EXPLAINED: Final = 0.3  # least explained share of an accepted hypothesis
+MOUNTING_STEPS: Final = 5  # Gauss-Newton steps for the mounting of the sensor
+LEAST_MATCHES: Final = 60  # least number of matched detections for the mounting
+WORST_CONDITION: Final = 1e6  # largest condition number for the mounting
+LATEST_STAMPS: Final = 10.0  # largest candidate delay or lead of detections (s)
+LATE_STEP: Final = 0.25  # step of the candidates (s)
+DEGREE: Final = float(np.pi / 180.0)  # degree in radians
 Content = Literal["twist", "twist in the map frame", "pose", "nothing"]
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What the columns of a log mean."""
+    """Meaning of the columns of a log."""
 
-    content: Content = "twist"  # of the odometry; with `nothing` the vehicle does not move at all
+    content: Content = "twist"  # content of the odometry; `nothing` is a vehicle at rest
     speed: float = 1.0  # unit of the speeds (m/s)
     rate: float = 1.0  # unit of the yaw rate (rad/s)
-    turn: float = 0.0  # of the detections' frame in the vehicle's, to the left (degrees)
-    mirrored: bool = False  # whether its y axis points to the other side, seen from its x axis
-    late: float = 0.0  # how much too large the stamps of the detections are (s)
+    turn: float = 0.0  # rotation of the detections' frame in the vehicle's, positive to the left (degrees)
+    mirrored: bool = False  # whether that frame is left-handed
+    late: float = 0.0  # excess of the stamps of the detections (s)
 
     @property
     def stands(self) -> tuple[float, bool]:
@@ -176,7 +178,7 @@ class Hypothesis:
         return rotation(self.turn * DEGREE) @ np.diag([1.0, -1.0 if self.mirrored else 1.0])
 
     def poses(self, odometry: Odometry) -> Array:
-        """Return the poses (N, 3) at the stamps, in a frame of their own; theta is not wrapped."""
+        """Integrate the odometry to poses (N, 3) at its stamps; theta is not wrapped."""
         measured = odometry.twist * [self.speed, self.speed, self.rate]
         if self.content == "pose":
             return np.column_stack([measured[:, :2], np.unwrap(measured[:, 2])])
@@ -188,7 +190,7 @@ class Hypothesis:
         return np.concatenate([np.zeros((1, 3)), moved])
 
 
-SPEED_UNITS: Final = {  # what a unit of the speeds (m/s) means
+SPEED_UNITS: Final = {  # words for units of the speeds, by size in m/s
     1.0 / 3.6: "are in km/h, not in m/s",
     0.44704: "are in miles per hour, not in m/s",
     0.514444: "are in knots, not in m/s",
@@ -197,12 +199,12 @@ SPEED_UNITS: Final = {  # what a unit of the speeds (m/s) means
     3.6: "were divided by 3.6 although they were in m/s",
     1e3: "were divided by 1000 although they were in m/s",
 }
-RATE_UNITS: Final = {  # what a unit of the yaw rate (rad/s) means
+RATE_UNITS: Final = {  # words for units of the yaw rate, by size in rad/s
     DEGREE: "is in degrees per second, not in rad/s",
-    1.0 / DEGREE: "was turned from degrees to radians although it was in rad/s",
+    1.0 / DEGREE: "was converted from degrees to radians although it was in rad/s",
 }
-AS_WRITTEN: Final = Hypothesis()  # the log means what it should
-MEANINGS: Final = (  # of the odometry; of equally good ones the first is told
+AS_WRITTEN: Final = Hypothesis()  # the log conforms to the format
+MEANINGS: Final = (  # candidate meanings of the odometry; of equally good ones the first wins
     AS_WRITTEN,
     Hypothesis("nothing"),
     *(Hypothesis(rate=rate) for rate in RATE_UNITS),
@@ -218,10 +220,10 @@ MEANINGS: Final = (  # of the odometry; of equally good ones the first is told
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """How well a hypothesis explains the pairs of cycles."""
+    """Fit of a hypothesis to the pairs of cycles."""
 
     hypothesis: Hypothesis
-    explained: Array  # share (P,) of the detections of each pair that is explained
+    explained: Array  # explained share (P,) of the detections of each pair
     sided: float = 0.0  # share of the labelled detections on the side of their label
 
     @property
@@ -230,7 +232,7 @@ class Trial:
 
 
 def far_better(trial: Trial, reference: Trial) -> dict[str, float] | None:
-    """Return the shares (%) that both explain where they differ, None unless the trial is clearly better."""
+    """Return the explained shares (%) on discriminating pairs; None unless the trial is clearly better."""
     gain = trial.explained - reference.explained
     telling: BoolArray = np.abs(gain) > TELLING_PAIR
     if not telling.any():
@@ -242,9 +244,11 @@ def far_better(trial: Trial, reference: Trial) -> dict[str, float] | None:
 
 
 class Trials:
+    """Evaluation of hypotheses on the pairs of cycles of a log."""
+
     def __init__(self, log: Log, pairs: Pairs) -> None:
         self.log, self.pairs = log, pairs
-        self._poses: dict[Hypothesis, Array] = {}  # by what the odometry means
+        self._poses: dict[Hypothesis, Array] = {}  # by meaning of the odometry
 
     def motion(self, hypothesis: Hypothesis) -> Array:
         """Return the motion (P, 3) of the vehicle from the earlier to the later cycle of each pair."""
@@ -264,14 +268,14 @@ class Trials:
         return self.trial(AS_WRITTEN)
 
     def best(self) -> Trial:
-        """Return the hypothesis that explains most; labels on their sides decide between equal ones."""
+        """Return the trial with the largest explained share; labels decide between equally good ones."""
         trials = [self.as_written, *(self.trial(one) for one in self._others())]
         most = max(trial.share for trial in trials)
         near = [trial for trial in trials if trial.share > most - EQUAL_SHARES]
         return max(near, key=lambda trial: trial.sided > max(one.sided for one in near) - SIDED_BETTER)
 
     def _others(self) -> Iterator[Hypothesis]:
-        """Yield frames in fine steps for a right odometry, and in quarter turns for any other."""
+        """Yield frames in fine steps for odometry as written, and in quarter turns for other meanings."""
         for meaning in MEANINGS:
             step = TURN_STEP if meaning == AS_WRITTEN else 90.0
             for turn in np.arange(0.0, 360.0, step).tolist():
@@ -281,7 +285,7 @@ class Trials:
                         yield one
 
     def sided(self, matrix: Array) -> float:
-        """Return the share of labelled detections on the side of their label in a frame; 0.5 without any."""
+        """Return the share of labelled detections on their label's side in a frame; 0.5 without labels."""
         points, labels = self._labelled
         on_side = ((points @ matrix.T)[:, 1] > 0.0) == (labels == LEFT)
         return float(on_side.mean()) if len(labels) else 0.5
@@ -296,26 +300,26 @@ class Trials:
         return points[near], labels[near]
 
 
-# --- where the sensor is in the vehicle, and how late it is ----------------------------------------------
+# --- mounting and latency of the sensor ------------------------------------------------------------------
 
 MEDIAN_SQUARE: Final = 2.0 * float(np.log(2.0))  # median of |x|^2 of two standard normals
 
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """How the sensor stands in the vehicle, beyond the frame of a hypothesis."""
+    """Mounting of the sensor relative to the frame of a hypothesis."""
 
-    values: Array  # (3,) turn to the left (rad), and place ahead and to the left of the odometry's point (m)
+    values: Array  # (3,) yaw to the left (rad), and lever arm l: ahead and left of the odometry's point (m)
     sigmas: Array  # (3,) their standard deviations
     scatter: float  # median distance of detections of one cone (m)
-    claimed: float  # the same by their covariances (m)
+    claimed: float  # median distance according to their covariances (m)
 
 
 def mounting_of(trials: Trials, hypothesis: Hypothesis) -> Mounting | None:
-    """Return the mounting under which nearby detections lie on each other best; None without any.
+    """Return the mounting that minimizes the distances of matched detections; None if it is not observable.
 
-    A cone at a (vehicle frame, earlier cycle) and b (later) with the motion (R, t) between them leaves
-    `a - R b - t + (J t) yaw + (I - R) l`, in first order of the yaw and exactly in the lever arm l.
+    A cone at a (earlier vehicle frame) and b (later), with the motion (R, t) between them, has the residual
+    `a - R b - t + (J t) yaw + (I - R) l`: first order in the yaw, exact in the lever arm l.
     """
     motion, frame = trials.motion(hypothesis), hypothesis.frame
     values = np.zeros(3)
@@ -331,20 +335,20 @@ def mounting_of(trials: Trials, hypothesis: Hypothesis) -> Mounting | None:
             return None
         values = values - np.linalg.solve(normal, np.einsum("nki,nk->i", columns, off))
     scores, inverse = np.zeros((len(motion), 3)), np.linalg.inv(normal)
-    np.add.at(scores, rows, np.einsum("nki,nk->ni", columns, off))  # a pair's matches are one observation
+    np.add.at(scores, rows, np.einsum("nki,nk->ni", columns, off))  # matches of a pair are dependent
     sigmas = np.sqrt(np.diag(inverse @ (scores.T @ scores) @ inverse))
     claimed = np.median(np.sqrt(variances * MEDIAN_SQUARE))
     return Mounting(values, sigmas, float(np.median(np.hypot(*off.T))), float(claimed))
 
 
 def lever(motion: Array, arm: Array) -> Array:
-    """Return what a lever arm (2,) adds to motions (P, 3): a sensor there moves by `t + (R - I) l`."""
+    """Return the change `(R - I) l` of motions (P, 3) for a sensor at the lever arm l (2,)."""
     c, s = np.cos(motion[:, 2]) - 1.0, np.sin(motion[:, 2])
     return np.column_stack([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1], np.zeros(len(motion))])
 
 
 def _matches(trials: Trials, frame: Array, motion: Array) -> tuple[Array, Array, IntArray]:
-    """Return offsets (n, 2) of mutually nearest detections, a coordinate's variances (n,), and pairs (n,)."""
+    """Return offsets (n, 2) of mutually nearest detections, their variances (n,), and their pairs (n,)."""
     pairs = trials.pairs
     square = np.moveaxis(pairs.distances(frame, motion), -1, 0)
     forth, back = square.argmin(axis=2), square.argmin(axis=1)
@@ -357,7 +361,7 @@ def _matches(trials: Trials, frame: Array, motion: Array) -> tuple[Array, Array,
 
 
 def best_lateness(trials: Trials, best: Trial) -> Trial:
-    """Return the trial of the lateness of the detections under which a hypothesis explains most."""
+    """Return the trial with the best latency of the detections for a hypothesis."""
     steps = np.arange(-LATEST_STAMPS, LATEST_STAMPS + LATE_STEP, LATE_STEP)
     others = (trials.trial(replace(best.hypothesis, late=late)) for late in steps[steps != 0.0].tolist())
     return max([best, *others], key=lambda trial: trial.share)

@@ -1,7 +1,7 @@
-"""The next metres of the track in the vehicle's own frame, for a controller.
+"""The next metres of the track in the vehicle frame, for a controller.
 
-It is the line of `centre_line`, but a hundred times faster: each boundary is sampled once, and near a sample
-it is taken as the circle that osculates it there.
+The line is that of `centre_line`, computed a hundred times faster: each boundary is sampled once, and
+approximated by its osculating circle near each sample.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,35 +21,35 @@ from .bspline import dot
 from .centre_line import points_across
 
 LEAST_STEP: Final = 0.01  # least distance of the points of a line (m)
-MOST_POINTS: Final = 200_000  # largest number of points of a line, which bounds the memory
-_AHEAD_STEP: Final = 0.5  # of boundaries (m); the circle at a sample is right to a millimetre
-_ACROSS_STRIDE: Final = 2  # stride of the samples among which the points across are searched
-_SAMPLES_BEHIND: Final = 3.0  # of the first sample behind the vehicle (m), since it may stand askew
-_OUTER_LENGTH: Final = 1.8  # largest length of a turn's outer boundary by that of the centre line
-_SETTLING_STEPS: Final = 8  # largest number of Newton steps that settle the stations; mostly two are enough
+MOST_POINTS: Final = 200_000  # largest number of points of a line; bounds the memory
+_AHEAD_STEP: Final = 0.5  # distance of the samples of a boundary (m); keeps the circle's error below a mm
+_ACROSS_STRIDE: Final = 2  # stride of the samples among which points across are searched
+_SAMPLES_BEHIND: Final = 3.0  # distance of the first sample behind the vehicle (m), which may stand askew
+_OUTER_LENGTH: Final = 1.8  # largest length of a turn's outer boundary, relative to the centre line
+_SETTLING_STEPS: Final = 8  # largest number of Newton steps of the stations; two are mostly enough
 _LINE_SETTLED: Final = 1e-3  # largest difference of the distances from both boundaries on the line (m)
-_LARGEST_GAP: Final = 2.0  # largest number of steps between neighbours
+_LARGEST_GAP: Final = 2.0  # largest distance of neighbours, in steps
 
 
 @dataclass(frozen=True, eq=False)
 class CurveAhead:
     """A boundary in the direction of travel, and the vehicle's place on it."""
 
-    tables: SpanPolynomials  # basis, whose parameter is about a length in m
-    control_points: Array  # (n, 2) control points in m, map frame; those of a closed curve repeat
-    beside: float  # parameter of about the vehicle's foot point
-    until: float = np.inf  # parameter up to which an open curve is confirmed, where it ends
+    tables: SpanPolynomials  # basis; its parameter is about a length in m
+    control_points: Array  # (n, 2) in m, map frame; unwrapped if the curve is closed
+    beside: float  # parameter near the vehicle's foot point
+    until: float = np.inf  # parameter up to which an open curve is confirmed
     tentative: Array | None = None
-    """(k, 2) Points through which the boundary leads on from its end, as far as is known (m, map frame)."""
-    confirmed: bool = True  # whether the curve itself is sure not to be taken back
+    """(k, 2) Points through which the boundary may continue from its end (m, map frame)."""
+    confirmed: bool = True  # whether the curve can no longer be taken back
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TrackAhead:
     """The next stretch of the track in the vehicle's frame (x forward, y left, m and rad).
 
-    The centre line has n points, each equally far from both boundaries: none where only one boundary is
-    known, and fewer than were asked for where the map ends.
+    The centre line has n points, each equally far from both boundaries. It has none if only one boundary is
+    known, and fewer than requested if the map ends before.
     """
 
     LENGTHS: ClassVar = {"curvature": -1} | dict.fromkeys(
@@ -59,7 +59,7 @@ class TrackAhead:
     points: Array
     """Points (n, 2) in m; the first one is beside the vehicle."""
     heading: Array
-    """Direction of travel (n,) in rad from that of the vehicle, in (-pi, pi]."""
+    """Direction of travel (n,) in rad, relative to the vehicle's heading, in (-pi, pi]."""
     curvature: Array
     """Curvature (n,) in 1/m, positive in a left turn."""
     arc_length: Array
@@ -69,25 +69,25 @@ class TrackAhead:
     width_right: Array
     """Distance (n,) along the normal to the right boundary, in m."""
     confirmed: BoolArray
-    """Whether both boundaries are confirmed at each point (n,); another one may be taken back."""
+    """Whether both boundaries are confirmed at each point (n,); other points may still change."""
     left: Array
     """Points (k, 2) of the left boundary from beside the vehicle on, in m."""
     right: Array
     """Points (h, 2) of the right boundary from beside the vehicle on, in m."""
     closed: ClassVar[bool] = False
-    """What is ahead is a stretch, also of a closed track."""
+    """The track ahead is an open stretch, also on a closed track."""
 
     def __repr__(self) -> str:
         return f"TrackAhead({len(self.points)} points on {self.length:.1f} m)"
 
     @property
     def length(self) -> float:
-        """Return how far the centre line is known, in m."""
+        """Length of the known centre line (m)."""
         return float(self.arc_length[-1]) if len(self.arc_length) else 0.0
 
 
 def check_length(name: str, length: float, least: float = 0.0) -> None:
-    """Raise a SettingsError unless a length (m) is a positive number, and at least the given one."""
+    """Raise a SettingsError unless a length (m) is positive and at least `least`."""
     if isinstance(length, Real) and least <= length < np.inf and length > 0.0:
         return
     expected = f"a number of at least {least:g} m" if least else "a positive number (m)"
@@ -96,7 +96,7 @@ def check_length(name: str, length: float, least: float = 0.0) -> None:
 
 
 def check_line(distance: float, step: float, scale: float) -> None:
-    """Raise a SettingsError unless a scene of this scale can have such a line ahead, in its metres."""
+    """Raise a SettingsError unless distance and step (m) are in range for a scene of this scale."""
     check_length("step", step, LEAST_STEP * scale)
     check_length("distance", distance)
     check_length("step", step, distance / MOST_POINTS)
@@ -122,7 +122,7 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """A boundary at n places, map frame; stations count from beside the vehicle."""
+    """Samples (n,) of a boundary, map frame; stations (m) begin beside the vehicle."""
 
     points: Array
     tangents: Array
@@ -135,10 +135,10 @@ def _sampled(curve: CurveAhead, distance: float) -> _Samples:
     tables = curve.tables
     begin, end = curve.beside - _SAMPLES_BEHIND, curve.beside + _OUTER_LENGTH * distance + _SAMPLES_BEHIND
     if tables.periodic:
-        end = min(end, begin + tables.length)  # at most once round
+        end = min(end, begin + tables.length)  # at most one period
     else:
         begin, end = max(begin, tables.low), min(end, tables.high, curve.until)
-    # a sample is beside the vehicle, if the curve is there
+    # put a sample beside the vehicle, unless the curve begins or ends there
     first = int(np.floor((begin - curve.beside) / _AHEAD_STEP + _LINE_SETTLED))
     last = int(np.ceil((end - curve.beside) / _AHEAD_STEP - _LINE_SETTLED))
     u = curve.beside + _AHEAD_STEP * np.arange(first, last + 1)
@@ -148,7 +148,7 @@ def _sampled(curve: CurveAhead, distance: float) -> _Samples:
     parts = list(np.einsum("rkj,kjd->rkd", values, curve.control_points[columns]))
     confirmed = np.full(len(u), curve.confirmed)
     if curve.tentative is not None and len(curve.tentative):
-        on = _led_on(parts[0][-1], parts[1][-1], curve.tentative)
+        on = _continued(parts[0][-1], parts[1][-1], curve.tentative)
         parts = [np.concatenate(pair) for pair in zip(parts, on, strict=True)]
         confirmed = np.append(confirmed, np.zeros(len(on[0]), bool))
     points, first_order, second = parts
@@ -159,7 +159,7 @@ def _sampled(curve: CurveAhead, distance: float) -> _Samples:
     return _Samples(points, first_order / speed[:, None], curvature, station, confirmed)
 
 
-def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Array]:
+def _continued(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Array]:
     """Return positions and two derivatives (n, 2) of a Catmull-Rom cubic from an end (2,) through points."""
     nodes = np.concatenate([end[None], points])
     edges = np.diff(nodes, axis=0)
@@ -180,14 +180,14 @@ def _led_on(end: Array, slope: Array, points: Array) -> tuple[Array, Array, Arra
 
 
 def _first_line(left: _Samples, right: _Samples) -> Array:
-    """Return the middles between samples of the left boundary and those across, in the order of travel.
+    """Return the midpoints of samples of the left boundary and the samples across, in driving order.
 
-    Each row (4,) is a middle (m, map frame) and the stations of both samples (m).
+    Each row (4,) is a midpoint (m, map frame) and the stations of both samples (m).
     """
     of = slice(None, None, _ACROSS_STRIDE)
     lefts, rights = left.points[of], right.points[of]
     stations = left.station[of], right.station[of]
-    apart = 0.5 * min(left.station[-1], right.station[-1])  # a loop must not be paired across its ends
+    apart = 0.5 * min(left.station[-1], right.station[-1])  # do not pair a loop across its ends
     i, j = points_across((lefts, rights), (left.tangents[of], right.tangents[of]), stations, apart)
     forward = j >= np.maximum.accumulate(j)
     i, j = i[forward], j[forward]
@@ -198,7 +198,7 @@ def _first_line(left: _Samples, right: _Samples) -> Array:
 
 
 def _from_beside(line: Array, position: Array, distance: float, step: float) -> Array:
-    """Return the line (n, 4) at even steps, from the point beside a position (2,) on."""
+    """Resample the line (n, 4) at even steps, from the point beside a position (2,) on."""
     edges = np.diff(line[:, :2], axis=0)
     squares = dot(edges, edges)
     offset = position - line[:-1, :2]
@@ -215,7 +215,7 @@ def _from_beside(line: Array, position: Array, distance: float, step: float) -> 
 def _settled(
     left: _Samples, right: _Samples, line: Array, pose: Array, step: float, sides: Sequence[Array]
 ) -> TrackAhead:
-    """Return the track ahead at the points of the line, moved along its normals to equal distances."""
+    """Move the points of the line along its normals until both boundaries are equally far."""
     points, feet = line[:, :2], [_Feet(left, line[:, 2]), _Feet(right, line[:, 3])]
     for _ in range(_SETTLING_STEPS):
         for foot in feet:
@@ -248,10 +248,10 @@ def _settled(
 
 
 class _Feet:
-    """Foot points (n,) of stations on a boundary, by the circle that osculates it at a sample.
+    """Foot points (n,) on a boundary, by its osculating circle at the nearest sample.
 
-    In the frame of the sample, with a point at (a, b), a along and b to the left, and the curvature k, the
-    circle has its centre at (0, 1 / k). With q = |(k a, 1 - k b)| the distance is
+    In the frame of the sample, a point is at (a, b), a along and b to the left. With the curvature k, the
+    centre of the circle is at (0, 1 / k), and with q = |(k a, 1 - k b)| the distance is
     `(2 b - k (a^2 + b^2)) / (1 + q)`.
     """
 
@@ -261,7 +261,7 @@ class _Feet:
         self._normals = left_of(samples.tangents)
 
     def find(self, points: Array) -> None:
-        """Find the foot points of points (n, 2), and go on to the sample that is nearest to each."""
+        """Find the foot points of points (n, 2), each by its nearest sample."""
         samples, last = self._samples, len(self._samples.station) - 1
         self._frame(points)
         ahead = self.a / self.spread
@@ -295,13 +295,13 @@ class _Feet:
 
     @property
     def offset_curvature(self) -> Array:
-        """Return k / (1 - k d) (n,), the curvature of the parallel curve through each point."""
+        """Curvature `k / (1 - k d)` (n,) of the parallel curve through each point."""
         return np.asarray(self.k / self._spread(self.distance))
 
     def width(self, points: Array, way: Array) -> Array:
-        """Return how far (n,) the circle is from points (n, 2) along unit vectors (n, 2).
+        """Distance (n,) of the circle from points (n, 2) along unit vectors (n, 2).
 
-        The distance w solves `k w^2 + 2 w (k (a s + b t) - t) + k (a^2 + b^2) - 2 b = 0` for the way (s, t).
+        The distance w along (s, t) solves `k w^2 + 2 w (k (a s + b t) - t) + k (a^2 + b^2) - 2 b = 0`.
         """
         s, t = dot(way, self._samples.tangents[self._at]), dot(way, self._normals[self._at])
         half = self.k * (self.a * s + self.b * t) - t
@@ -311,6 +311,6 @@ class _Feet:
 
 
 def _distances(points: Array) -> Array:
-    """Return the distance (n,) of each point from the one before, and 0 for the first."""
+    """Distance (n,) of each point from the one before, 0 for the first."""
     edges = np.diff(points, axis=0, prepend=points[:1])
     return np.asarray(np.hypot(edges[:, 0], edges[:, 1]))

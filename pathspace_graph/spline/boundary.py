@@ -1,4 +1,4 @@
-"""A boundary as the mappers hold it: an open spline that grows, periodic after closing; and crossings."""
+"""A boundary of the map: an open spline that grows and becomes periodic at closure; and crossings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from pathspace_graph.factors._kernels import Curves
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials
-from pathspace_graph.factors.footpoint import FootPoints, joint_foot_points, refine_joint_foot_points
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import greville, smoothness_coefficients, smoothness_matrix
 from pathspace_graph.factors.se2 import move_points, path_lengths
 from pathspace_graph.labels import LEFT, RIGHT
@@ -18,8 +18,8 @@ from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 
 from .bspline import BSpline, segments_cross, side_of
 
-KNOT_ROUND_OFF = 1e-9  # largest difference from a knot of parameters that lie on it (m)
-SAME_DIRECTION = 0.5  # least cosine of the angle between the curve beside a vehicle and the vehicle's heading
+KNOT_ROUND_OFF = 1e-9  # tolerance of a parameter that lies on a knot (m)
+SAME_DIRECTION = 0.5  # least cosine of the angle between a curve and the heading of a vehicle beside it
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,48 +27,50 @@ class Gauge:
     """Spacing and smoothness priors of a stretch of control points, by their indices."""
 
     points: IntArray  # (k,) control points in driving order
-    pairs: IntArray  # (r, 2) each row is a control point and the next one
+    pairs: IntArray  # (r, 2) neighbouring control points
     nominal: Array  # (r,) nominal distance of each pair (m)
-    triples: IntArray  # (t, 3) three control points in a row that follow one another
-    bending: Array  # (t, 3) coefficients of a triple's second difference in sigmas (1/m)
+    triples: IntArray  # (t, 3) three consecutive control points
+    bending: Array  # (t, 3) coefficients of a triple's second difference, in sigmas (1/m)
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """How an extension places control points: a linear map of what they are fitted to.
+    """Placement of control points by an extension, a linear map of what they are fitted to.
 
-    Those from index `kept` on are `by_known @ known[first:] + by_target @ targets`, and the second
-    differences that the fit assumes to be zero would move them by `by_bend`.
+    Control points from index `kept` on are `by_known @ known[first:] + by_target @ targets`. The fit assumes
+    second differences of zero; `by_bend` is the derivative by these.
     """
 
-    first: int  # index from which on the fit depends on the known control points
-    kept: int  # index before which the control points stay where they are
+    first: int  # index of the first known control point that the fit depends on
+    kept: int  # number of control points that do not move
     by_known: Array  # (f, n - first) derivative of the placed control points by the known ones
-    by_target: Array  # (f, k) their derivative by the targets
-    by_bend: Array  # (f, t) their derivative by the second differences
+    by_target: Array  # (f, k) derivative by the targets
+    by_bend: Array  # (f, t) derivative by the second differences
 
     def place(self, known: Array, targets: Array) -> Array:
-        """Return all control points (n', 2), from the known ones (n, 2) and the targets (k, 2)."""
+        """Return all control points (n', 2), given the known ones (n, 2) and the targets (k, 2)."""
         placed = self.by_known @ known[self.first :] + self.by_target @ targets
         return np.concatenate([known[: self.kept], placed])
 
 
 class Boundary:
-    """A B-spline that grows until the loop closes; its control points are graph variables.
+    """A B-spline that grows until the loop closes; its control points are variables of the graph.
 
-    An open one has uniform, floating (unclamped) knots, so that its parameter is about a length in m from the
+    An open boundary has uniform, floating (unclamped) knots. Its parameter is about the length (m) from the
     first cone.
     """
 
     def __init__(
         self, knots: Array, periodic: bool, settings: SplineSettings, gauge: GaugeSettings, first: int = 0
     ) -> None:
-        self.first = first  # number of the first control point's key; new knots have keys with new numbers
+        self.first = first  # number of the first control point's key; new knots get new numbers
         self.settings, self.gauge = settings, gauge
         self.degree, self.periodic = settings.degree, periodic
-        self.confirmed_end = 0.0  # parameter up to which cones support the curve, not extrapolated (m)
-        self.observed: Array = np.zeros((0, 2))  # cones that the curve was extended through, map frame (m)
-        self.cone_parameters: Array = np.zeros(0)  # (n,) parameter of each of them on the curve (m)
+        self.confirmed_end = 0.0  # parameter up to which cones support the curve (m)
+        self.observed: Array = np.zeros(
+            (0, 2)
+        )  # (n, 2) cones that the curve was grown through, map frame (m)
+        self.cone_parameters: Array = np.zeros(0)  # (n,) their parameters on the curve (m)
         self._set_tables(SpanPolynomials(knots, self.degree, periodic))
 
     def _set_tables(self, tables: SpanPolynomials) -> None:
@@ -79,17 +81,17 @@ class Boundary:
         following = self.abscissae[1:]
         if self.periodic:
             following = np.append(following, self.abscissae[0] + self.length)
-        self.nominal = following - self.abscissae[: len(following)]  # (m) from control point to point
+        self.nominal = following - self.abscissae[: len(following)]  # (m,) distances of neighbours (m)
         self.everything = np.arange(self.size)
         self._gauge: Gauge | None = None
 
     def gauge_on(self, points: IntArray) -> Gauge:
-        """Return the priors between control points (k,) in driving order; the last result is cached."""
+        """Return the priors between control points (k,) in driving order; the latest result is cached."""
         if self._gauge is not None and self._gauge.points is points:
             return self._gauge
         whole = self.periodic and len(points) == self.size
         abscissae = self.abscissae[points]
-        abscissae = abscissae + self.length * (abscissae < abscissae[:1])  # a stretch past the seam
+        abscissae = abscissae + self.length * (abscissae < abscissae[:1])  # unwrap a stretch past the seam
         spacing = float(np.mean(self.nominal))
         bending = smoothness_coefficients(abscissae, self.length if whole else None, spacing)
         first = points if whole else points[:-1]
@@ -109,22 +111,22 @@ class Boundary:
 
     @property
     def knots(self) -> Array:
-        """Return all knots; a periodic curve's continue past both ends of its domain."""
+        """All knots; those of a periodic curve continue past both ends of its domain."""
         return self.tables.knots
 
     @property
     def length(self) -> float:
-        """Return the length of the domain in parameter units (about metres)."""
+        """Length of the domain in parameter units (about metres)."""
         return self.tables.high - self.tables.low
 
     def extended(self, control_points: Array) -> Array:
-        """Return control points as the kernels take them: those of a periodic curve repeat at the end."""
+        """Unwrap control points for the kernels: those of a periodic curve repeat at the end."""
         if not self.periodic:
             return control_points
         return np.concatenate([control_points, control_points[: self.degree]])
 
     def columns(self, span: IntArray) -> IntArray:
-        """Return (m, degree + 1) the control points that shape the curve on each span (m,)."""
+        """Indices (m, degree + 1) of the control points that shape the curve on each span (m,)."""
         columns = span[:, None] - self.degree + np.arange(self.degree + 1)
         return columns % self.size if self.periodic else columns
 
@@ -132,13 +134,13 @@ class Boundary:
         return BSpline.on(self.tables, self.extended(control_points))
 
     def find(self, control_points: Array, points: Array, low: Array, high: Array) -> FootPoints:
-        """Search the foot points of points (m, 2) in the stretches [low, high], each (m,)."""
-        s, alone = self.settings, np.zeros(len(points), np.intp)
-        search = s.search_step, s.search_iterations
-        return joint_foot_points(self._curve_from(low), control_points, points, alone, low, high, *search)
+        """Find the foot points of points (m, 2) in the stretches [low, high], each (m,)."""
+        s, curve = self.settings, np.zeros(len(points), np.intp)
+        search = low, high, s.search_step, s.search_iterations
+        return FootPoints(*self._curve_from(low).search(control_points, points, curve, *search))
 
     def _curve_from(self, low: Array) -> Curves:
-        """Return the curve on its distinct control points; an open one from the least limit (m,) on."""
+        """Curve on its distinct control points; an open one from the least limit (m,) on."""
         if self.periodic:
             return Curves([self.tables], [0], [self.size])
         first = int(self.tables.locate(np.min(low, initial=np.inf, keepdims=True))[0][0])
@@ -150,43 +152,38 @@ class Boundary:
 
     def refine(self, control_points: Array, points: Array, u: Array) -> FootPoints:
         """Refine the foot points of points (m, 2), starting at the parameters u (m,)."""
-        s, alone = self.settings, np.zeros(len(points), np.intp)
+        s, curve = self.settings, np.zeros(len(points), np.intp)
         search = u, u - s.refine_room, self.within_trusted(u + s.refine_room), s.refine_iterations
         unwrapped = self.extended(control_points)
-        return refine_joint_foot_points(Curves([self.tables]), unwrapped, points, alone, *search)
+        return FootPoints(*Curves([self.tables]).refine(unwrapped, points, curve, *search))
 
     @property
     def trusted(self) -> float:
-        """Return the parameter up to which foot points are allowed: an open curve's end is extrapolated."""
+        """Parameter up to which foot points are allowed: beyond it, an open curve is extrapolated."""
         return np.inf if self.periodic else self.confirmed_end + self.settings.confirmed_margin
 
     @property
     def unseen(self) -> float:
-        """Return the length (m) of the curve's end, up to where it is confirmed, without any cone."""
+        """Length (m) without a cone at the end of the confirmed curve."""
         return self.confirmed_end - float(self.cone_parameters[-1:].sum())
 
     def within_trusted(self, high: Array) -> Array:
-        """Return upper limits (m,) of stretches, clipped so that they exclude the extrapolated end."""
+        """Clip upper limits (m,) of stretches, so that they exclude the extrapolated end."""
         return np.minimum(high, self.trusted)
 
     def evaluate(self, control_points: Array, u: Array, derivative: int = 0) -> Array:
         values, span = self.tables.evaluate(np.asarray(u, float), derivative)
         return np.asarray(np.einsum("mj,mjd->md", values[derivative], control_points[self.columns(span)]))
 
-    @property
-    def ends(self) -> tuple[float, float]:
-        """Return the parameters at which the domain begins and ends (m)."""
-        return self.tables.low, self.tables.high
-
     def basis(self, u: Array) -> Array:
-        """Return the weights (k, m) of the distinct control points at parameters (k,)."""
+        """Weights (k, m) of the distinct control points at parameters (k,)."""
         (values,), span = self.tables.evaluate(u)
         weights = np.zeros((len(u), self.size))
         np.put_along_axis(weights, self.columns(span), values, axis=1)
         return weights
 
     def closed(self, knots: Array) -> "Boundary":
-        """Return the boundary on periodic knots: all of it is confirmed, and its keys are new."""
+        """Make a closed boundary on periodic knots. It is confirmed, and its keys are new."""
         boundary = Boundary(knots, True, self.settings, self.gauge, self.first + self.size)
         boundary.confirmed_end = boundary.tables.high
         return boundary
@@ -194,8 +191,9 @@ class Boundary:
     def grow(self, control_points: Array, targets_u: Array, targets: Array) -> Array:
         """Extend the curve through targets (k, 2) at parameters (k,); return its control points (n', 2).
 
-        Knots are appended until the domain holds the last parameter, the new `confirmed_end`. Control points
-        that act only beyond the last cone before are placed again: the direction at the end was a guess.
+        Knots are appended until the domain contains the last parameter, the new `confirmed_end`. Control
+        points that act only beyond the previous last cone are placed again, since the direction there was a
+        guess.
         """
         before = int(self.cone_parameters.searchsorted(self.confirmed_end - KNOT_ROUND_OFF))
         from_u = float(self.cone_parameters[before - 1]) if before else self.confirmed_end
@@ -204,7 +202,8 @@ class Boundary:
     def extend(self, old: int, targets_u: Array, from_u: float | None = None) -> Placement:
         """Extend a curve of `old` control points to targets at parameters (k,); return how to place them.
 
-        It is placed anew from `from_u` on, by default from its confirmed end on; its end stays where it is.
+        The curve is placed again from `from_u` on, by default from its confirmed end. The confirmed end does
+        not move.
         """
         spacing = self.settings.spacing
         missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - KNOT_ROUND_OFF))
@@ -216,7 +215,7 @@ class Boundary:
         return placement
 
     def settled(self, size: int, u: float | None = None) -> int:
-        """Return how many of the first `size` control points act before u, by default `confirmed_end`."""
+        """Number of the first `size` control points that act before u, by default `confirmed_end`."""
         u = self.confirmed_end if u is None else u
         return max(int(np.searchsorted(self.knots[:size], u - KNOT_ROUND_OFF)) - 1, 0)
 
@@ -228,7 +227,7 @@ class Boundary:
         self.cone_parameters = np.append(self.cone_parameters, u)
 
     def take_back(self, kept: int) -> None:
-        """Remove all observed cones but the first `kept`; the curve is confirmed up to the last of these."""
+        """Remove all cones but the first `kept`, up to which the curve stays confirmed."""
         self.confirmed_end = float(self.cone_parameters[kept - 1])
         self.observed, self.cone_parameters = self.observed[:kept], self.cone_parameters[:kept]
 
@@ -241,7 +240,7 @@ class Boundary:
                 held_u = np.append(held_u, self.confirmed_end)
         values, span = self.tables.evaluate(np.concatenate([held_u, targets_u]))
         columns = self.columns(span)
-        first = max(min(int(columns.min()), kept - 2), 0)  # rows before this have no free column
+        first = max(min(int(columns.min()), kept - 2), 0)  # earlier rows have no free column
         weight, held, bent = self.settings.fit_smoothness, len(held_u), len(columns)
         matrix = np.zeros((bent, self.size - first))
         np.put_along_axis(matrix, columns - first, values[0], axis=1)
@@ -262,14 +261,15 @@ def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
 
 
 def ahead_of(at: Array | float, u: Array, length: float) -> Array:
-    """Return how far parameters u are ahead of others (m), the shorter way around a curve of a length."""
+    """Signed distance (m) from parameters `at` to u, the shorter way around a curve of a length."""
     return np.asarray(np.mod(u - at + 0.5 * length, length) - 0.5 * length)
 
 
 def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float) -> float:
-    """Return the parameter of the nearest point whose tangent is within 60 degrees of a pose's heading.
+    """Find the parameter of the nearest point whose tangent is within 60 degrees of a pose's heading.
 
-    A closed curve is searched everywhere, an open one on its last `room` metres, by default its end.
+    A closed curve is searched everywhere, an open one on its last `room` metres. Without such a point, the
+    result is the end.
     """
     low, high = boundary.tables.low, boundary.tables.high
     if not boundary.periodic:
@@ -289,25 +289,25 @@ def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float
 # --- whether boundaries cross ----------------------------------------------------------------------------
 
 NO_PATH: Final = np.zeros((0, 2))
-LEVEL_PATH_STEP: Final = 1.0  # step at which a driven path is looked at for crossings with itself (m)
-LEVEL_SINE: Final = 0.7  # of the angle of a level crossing, at least: laps over one road meet at less
-LEVEL_CROSSING: Final = 8.0  # largest distance of crossing boundaries from that of the path (m)
+LEVEL_PATH_STEP: Final = 1.0  # step of the path in which crossings with itself are searched (m)
+LEVEL_SINE: Final = 0.7  # least sine of the angle of a level crossing; laps on one road cross at less
+LEVEL_CROSSING: Final = 8.0  # largest distance of crossing boundaries from the crossing of the path (m)
 
 
 def sampled(spline: BSpline, step: float) -> Array:
-    """Return points (n, 2) of a spline, from its beginning to its end, about this step (m) apart."""
+    """Sample points (n, 2) of a spline from its beginning to its end, about `step` (m) apart."""
     low, high = spline.domain
     return spline.evaluate(np.linspace(low, high, max(int((high - low) / step), 1) + 1))
 
 
 def boundaries_cross(splines: Mapping[int, BSpline], step: float, path: Array = NO_PATH) -> bool:
-    """Return whether the left and the right boundary cross, sampled at this step (m)."""
+    """Whether the boundaries, sampled at a step (m), cross elsewhere than where the path crosses itself."""
     found = crossings(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
     return not at_level_crossing(found, path).all()
 
 
 def at_level_crossing(points: Array, path: Array) -> BoolArray:
-    """Return whether each point (m, 2) is at a place where a driven path (n, 2) crosses itself."""
+    """Whether a driven path (n, 2) crosses itself near each point (m, 2)."""
     if len(points) == 0 or len(path) < 2:
         return np.zeros(len(points), bool)
     _, kept = np.unique(path_lengths(path) // LEVEL_PATH_STEP, return_index=True)
@@ -316,7 +316,7 @@ def at_level_crossing(points: Array, path: Array) -> BoolArray:
 
 
 def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
-    """Return the points (k, 2) where two polylines cross at an angle of at least this sine."""
+    """Points (k, 2) where two polylines cross at an angle of at least this sine."""
     i, j, share = crossing_segments(a, b)
     (p, q), (r, s) = (a[i], a[i + 1]), (b[j], b[j + 1])
     turned = np.abs(side_of(p, q, p + s - r)) > sine * np.hypot(*(q - p).T) * np.hypot(*(s - r).T)
@@ -324,7 +324,7 @@ def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
 
 
 def crossing_segments(a: Array, b: Array) -> tuple[IntArray, IntArray, Array]:
-    """Return the segments (k,) of two polylines that cross each other, and the share of the first's."""
+    """Return the crossing segments (k,) of two polylines, and where on the first one they cross (k,)."""
     middle_a, middle_b = 0.5 * (a[1:] + a[:-1]), 0.5 * (b[1:] + b[:-1])
     reach = 0.5 * (np.hypot(*np.diff(a, axis=0).T).max() + np.hypot(*np.diff(b, axis=0).T).max())
     near = KDTree(middle_a).query_ball_tree(KDTree(middle_b), reach)

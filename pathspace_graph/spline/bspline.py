@@ -1,11 +1,11 @@
-"""Plane B-spline curves: evaluation, arc length, exact changes of the ends, and covariance."""
+"""Plane B-spline curves: evaluation, arc length, exact extension, and covariance."""
 
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, Self
 
 import numpy as np
-import scipy  # which imports its modules when they are used
+import scipy  # imports its modules on first use
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
@@ -22,11 +22,11 @@ from pathspace_graph.factors.se2 import left_of
 if TYPE_CHECKING:
     from scipy.interpolate import BSpline as ScipyBSpline
 
-_PERIODIC_TOLERANCE: Final = 1e-9  # of repeated values, over (1 + the largest)
+_PERIODIC_TOLERANCE: Final = 1e-9  # largest difference of repeated values, relative to 1 + the largest value
 _FOOT_GRID: Final = 8  # grid points on each span of a foot-point search over the whole curve
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
-_ARC_NEWTON_STEPS: Final = 4  # Newton steps that invert the arc length, from a table with the same grid
-_SHORTEST_EXTENSION: Final = 1e-3  # knot interval over the mean one, where the point is the end
+_ARC_NEWTON_STEPS: Final = 4  # Newton steps that invert the arc length, from a table on the same grid
+_SHORTEST_EXTENSION: Final = 1e-3  # shortest new knot interval, relative to the mean one
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -40,12 +40,12 @@ class BSpline:
     DIMENSION: ClassVar = 2
 
     knots: Array
-    """(n + p + 1,) Knots, never decreasing."""
+    """(n + p + 1,) Knots, non-decreasing."""
     control_points: Array
     """(n, 2) Control points in m, map frame; a periodic curve's last p repeat the first p."""
     degree: int = 3
     periodic: bool = False
-    """Whether the curve is closed: its parameters are taken modulo the length of the domain."""
+    """Whether the curve is closed: parameters are wrapped into the domain."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "knots", np.array(self.knots, dtype=np.float64))
@@ -101,17 +101,17 @@ class BSpline:
     def open_uniform(
         cls, control_points: Array, degree: int = 3, interval: float = 1.0, start: float = 0.0
     ) -> Self:
-        """Return a curve on equally spaced knots with floating (unclamped) ends, which begins at `start`."""
+        """Build a curve on equally spaced knots with floating (unclamped) ends, from `start` on."""
         return cls(uniform_knots(len(control_points), degree, interval, start), control_points, degree)
 
     @classmethod
     def clamped_from(cls, breaks: Array, control_points: Array, degree: int = 3) -> "BSpline":
-        """Return a clamped curve on breaks (k + 1,) with k + p control points."""
+        """Build a clamped curve on breaks (k + 1,) with k + p control points."""
         return cls(clamped_knots(breaks, degree), control_points, degree)
 
     @classmethod
     def periodic_from(cls, breaks: Array, control_points: Array, degree: int = 3) -> Self:
-        """Return a closed curve on one period of breaks (m + 1,) with m distinct control points."""
+        """Build a closed curve on one period of breaks (m + 1,) with m distinct control points."""
         if len(breaks) != len(control_points) + 1 or len(control_points) <= degree:
             raise SettingsError(
                 f"a periodic spline of m > {degree} distinct control points needs m + 1 breaks, "
@@ -122,14 +122,14 @@ class BSpline:
 
     @classmethod
     def on(cls, tables: SpanPolynomials, control_points: Array) -> Self:
-        """Return a curve that shares a basis; its control points (n, 2) are unwrapped."""
+        """Build a curve that shares a basis; control points (n, 2) are unwrapped."""
         spline = cls(tables.knots, control_points, tables.degree, tables.periodic)
         spline.__dict__["tables"] = tables
         return spline
 
     @classmethod
     def even(cls, low: float, high: float, intervals: int, periodic: bool, degree: int = 3) -> Self:
-        """Return a curve of zeros on equally spaced knots; the ends of an open one float."""
+        """Build a curve of zeros on equally spaced knots; an open one has floating ends."""
         if periodic:
             breaks = np.linspace(low, high, intervals + 1)
             return cls.periodic_from(breaks, np.zeros((intervals, cls.DIMENSION)), degree)
@@ -138,36 +138,36 @@ class BSpline:
 
     @property
     def domain(self) -> tuple[float, float]:
-        """Return the first and the last parameter, knots[p] and knots[n]."""
+        """First and last parameter, knots[p] and knots[n]."""
         return float(self.knots[self.degree]), float(self.knots[len(self.control_points)])
 
     @property
     def size(self) -> int:
-        """Return the number m of distinct control points."""
+        """Number m of distinct control points."""
         return len(self.control_points) - (self.degree if self.periodic else 0)
 
     @property
     def distinct_control_points(self) -> Array:
-        """Return (m, 2) the control points without those that a periodic curve repeats."""
+        """Control points (m, 2) without the repeated ones of a periodic curve."""
         return self.control_points[: self.size]
 
     @property
     def breaks(self) -> Array:
-        """Return the distinct knots of the domain, both ends included."""
+        """Distinct knots of the domain, both ends included."""
         return np.unique(self.knots[self.degree : len(self.control_points) + 1])
 
     @cached_property
     def tables(self) -> SpanPolynomials:
-        """Return the basis as polynomials on each span."""
+        """Basis as polynomials on each span."""
         return SpanPolynomials(self.knots, self.degree, self.periodic)
 
     def with_points(self, distinct: Array) -> Self:
-        """Return the spline of the same basis with other distinct control points (m, 2)."""
+        """Return the curve of the same basis with other distinct control points (m, 2)."""
         points = np.concatenate([distinct, distinct[: self.degree]]) if self.periodic else distinct
         return type(self).on(self.tables, points)
 
     def local_basis(self, u: Array, derivative: int = 0) -> tuple[Array, IntArray]:
-        """Return the basis (k, p + 1) at u (k,) and the distinct control points (k, p + 1) it multiplies."""
+        """Return basis values (k, p + 1) at u (k,), and the indices (k, p + 1) of their control points."""
         values, columns = self._local(u, derivative)
         return values[derivative], columns
 
@@ -177,58 +177,58 @@ class BSpline:
         return values, columns % self.size if self.periodic else columns
 
     def basis_matrix(self, u: Array, derivative: int = 0) -> Array:
-        """Return B (k, m) for the distinct control points: S(u) = B c."""
+        """Matrix B (k, m) of the basis on the distinct control points c: `S(u) = B c`."""
         values, span = self.tables.evaluate(u, derivative)
         return scatter(values[derivative], span - self.degree, self.size, self.periodic)
 
     def evaluate(self, u: Array, derivative: int = 0) -> Array:
-        """Return d^r S / du^r (k, 2) at u (k,); u is clipped to the domain, or wrapped if periodic."""
+        """Evaluate d^r S / du^r (k, 2) at u (k,); u is clipped to the domain, or wrapped if periodic."""
         values, columns = self.local_basis(u, derivative)
         position: Array = np.einsum("kj,kjd->kd", values, self.control_points[columns])
         return position
 
     def derivatives(self, u: Array, most: int) -> Array:
-        """Return S and its derivatives up to an order, (most + 1, k, 2), at u (k,), as `evaluate` does."""
+        """Evaluate S and its derivatives up to order `most`, (most + 1, k, 2), at u (k,)."""
         values, columns = self._local(u, most)
         return np.asarray(np.einsum("rkj,kjd->rkd", values, self.control_points[columns]))
 
     def tangent_unit(self, u: Array) -> Array:
-        """Return S' / |S'| (k, 2), which is zero where S' vanishes."""
+        """Unit tangents S' / |S'| (k, 2), zero where S' vanishes."""
         first = self.evaluate(u, 1)
         norm = np.linalg.norm(first, axis=1, keepdims=True)
         return np.asarray(np.divide(first, norm, out=np.zeros_like(first), where=norm > 0.0))
 
     def normal_unit(self, u: Array) -> Array:
-        """Return the unit normals (k, 2) to the left, which are zero where S' vanishes."""
+        """Unit normals (k, 2) to the left, zero where S' vanishes."""
         return left_of(self.tangent_unit(u))
 
     def curvature(self, u: Array) -> Array:
-        """Return (x' y'' - y' x'') / |S'|^3 (k,) in 1/m: positive in a left turn, zero where S' vanishes."""
+        """Curvature `(x' y'' - y' x'') / |S'|^3` (k,) in 1/m, positive to the left; 0 where S' vanishes."""
         _, first, second = self.derivatives(u, 2)
         bent = cross(first, second)
         cube = np.linalg.norm(first, axis=1) ** 3
         return np.asarray(np.divide(bent, cube, out=np.zeros_like(bent), where=cube > 0.0))
 
     def foot_points(self, points: Array) -> FootPoints:
-        """Search the whole curve for the foot points of points (k, 2), map frame."""
+        """Find the foot points of points (k, 2), map frame, on the whole curve."""
         low, high = self.domain
         step = (high - low) / (_FOOT_GRID * (len(self.control_points) - self.degree))
         lows, highs = np.full(len(points), low), np.full(len(points), high)
         return foot_points(self.tables, self.control_points, points, lows, highs, step)
 
     def length(self) -> float:
-        """Return the length of the curve in m."""
+        """Length of the curve (m)."""
         return float(self._break_lengths[-1])
 
     def arc_length(self, u: Array) -> Array:
-        """Return the length (k,) from the first parameter to u (k,), in m: Gauss-Legendre on each span."""
+        """Arc length (k,) from the first parameter to u (k,), in m, by Gauss-Legendre on each span."""
         breaks = self.breaks
         u = np.clip(u, breaks[0], breaks[-1])
         index = np.clip(np.searchsorted(breaks, u, side="right") - 1, 0, len(breaks) - 2)
         return self._break_lengths[index] + self._gauss_lengths(breaks[index], u)
 
     def parameters_at(self, lengths: Array) -> Array:
-        """Return u (k,) at arc lengths (k,), clipped to the curve: the inverse of `arc_length`."""
+        """Parameters u (k,) at arc lengths (k,), clipped to the curve: the inverse of `arc_length`."""
         low, high = self.domain
         lengths = np.clip(lengths, 0.0, self.length())
         grid = np.linspace(low, high, _FOOT_GRID * (len(self.breaks) - 1) + 1)
@@ -245,38 +245,34 @@ class BSpline:
         return np.concatenate([[0.0], np.cumsum(self._gauss_lengths(breaks[:-1], breaks[1:]))])
 
     def _gauss_lengths(self, starts: Array, ends: Array) -> Array:
-        """Return the integrals (k,) of |S'| over intervals that cross no knot."""
+        """Integrals (k,) of |S'| over intervals without a knot inside."""
         half = 0.5 * (ends - starts)
         nodes = (0.5 * (starts + ends))[:, None] + half[:, None] * _GAUSS_NODES
         speed = np.linalg.norm(self.evaluate(nodes.ravel(), 1), axis=1).reshape(nodes.shape)
         return np.asarray(half * (speed @ _GAUSS_WEIGHTS))
 
     def with_end_knots(self, knots: Array) -> "BSpline":
-        """Return the same curve on knots that differ only outside the domain; the change is exact."""
+        """Return the same curve, exactly, on knots that differ only outside the domain."""
         self._refuse_periodic("change the ends of")
         matrix = end_change_matrix(self.knots, self.degree, knots)
         return BSpline(knots, matrix @ self.control_points, self.degree)
 
-    def clamp(self, start: bool = True, end: bool = True) -> "BSpline":
-        """Return the same curve with (p + 1)-fold knots at the chosen ends, which become control points."""
+    def clamp(self) -> "BSpline":
+        """Return the same curve with (p + 1)-fold knots at its ends, which become control points."""
         knots, p = self.knots.copy(), self.degree
-        if start:
-            knots[:p] = knots[p]
-        if end:
-            knots[-p:] = knots[-p - 1]
+        knots[:p] = knots[p]
+        knots[-p:] = knots[-p - 1]
         return self.with_end_knots(knots)
 
-    def unclamp(self, start: bool = True, end: bool = True) -> "BSpline":
-        """Return the same curve with floating ends: p knots repeat the chosen end's interval outward."""
+    def unclamp(self) -> "BSpline":
+        """Return the same curve with floating ends: p knots repeat the interval at each end outward."""
         knots, p, outward = self.knots.copy(), self.degree, np.arange(1, self.degree + 1)
-        if start:
-            knots[:p] = knots[p] - (knots[p + 1] - knots[p]) * outward[::-1]
-        if end:
-            knots[-p:] = knots[-p - 1] + (knots[-p - 1] - knots[-p - 2]) * outward
+        knots[:p] = knots[p] - (knots[p + 1] - knots[p]) * outward[::-1]
+        knots[-p:] = knots[-p - 1] + (knots[-p - 1] - knots[-p - 2]) * outward
         return self.with_end_knots(knots)
 
     def extension_knots(self, point: Array) -> Array:
-        """Return the knots (n + p + 2,) of `extend_to`; the new interval follows from the chord."""
+        """Knots (n + p + 2,) of `extend_to`; the new interval is proportional to the chord."""
         low, high = self.domain
         chord = float(np.linalg.norm(point - self.evaluate(np.array([high]))[0]))
         mean = (high - low) / (len(self.breaks) - 1)
@@ -287,14 +283,14 @@ class BSpline:
         return np.concatenate([kept, np.full(self.degree + 1, new_end)])
 
     def extend_to(self, point: Array) -> "BSpline":
-        """Return the curve extended to a point (2,), its last control point (Hu et al. 2002)."""
+        """Extend the curve to a point (2,), its new last control point (Hu et al. 2002)."""
         self._refuse_periodic("extend")
         knots = self.extension_knots(point)
         kept = end_change_matrix(self.knots, self.degree, knots) @ self.control_points
         return BSpline(knots, np.concatenate([kept, np.reshape(point, (1, 2))]), self.degree)
 
     def covariance_at(self, u: Array, joint_covariance: Array) -> Array:
-        """Return cov S(u) = B Sigma B^T (k, 2, 2), cross terms between control points included.
+        """Covariance `cov S(u) = B Sigma B^T` (k, 2, 2), with the cross terms between control points.
 
         The joint covariance Sigma (2 m, 2 m) is ordered by control point: x0, y0, x1, y1 and so on.
         """
@@ -305,13 +301,13 @@ class BSpline:
         return covariance
 
     def normal_sigma(self, u: Array, joint_covariance: Array) -> Array:
-        """Return sqrt(n^T cov S(u) n) (k,): the standard deviation across the curve in m."""
+        """Standard deviation `sqrt(n^T cov S(u) n)` (k,) across the curve, in m."""
         normal = self.normal_unit(u)
         variance = np.einsum("ka,kab,kb->k", normal, self.covariance_at(u, joint_covariance), normal)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def to_scipy(self) -> "ScipyBSpline":
-        """Return the same curve as scipy's class, which gives NaN outside of an open domain."""
+        """Convert the curve to scipy's class, which gives NaN outside the domain of an open curve."""
         beyond: Literal["periodic", False] = "periodic" if self.periodic else False
         return scipy.interpolate.BSpline(self.knots, self.control_points, self.degree, extrapolate=beyond)
 
@@ -321,11 +317,11 @@ class BSpline:
 
 
 def end_change_matrix(knots: Array, degree: int, new_knots: Array) -> Array:
-    """Return M (n, n) with C_new = M C, which keeps the curve where only knots outside the domain change.
+    """Matrix M (n, n) with `C_new = M C`, which preserves the curve if only knots outside the domain change.
 
     The control point c_j is the blossom, at the knots t_{j+1} to t_{j+p}, of the polynomial of any span that
-    it acts on (Ramshaw 1989). So clamping, unclamping and the extension of Hu et al. (2002) are one formula.
-    The first and the last span of the domain must not be empty. Knots beyond index n + p - 1 are not read.
+    it acts on (Ramshaw 1989). So one formula clamps, unclamps, and extends as Hu et al. (2002). The first and
+    the last span of the domain must not be empty. Knots beyond index n + p - 1 are not read.
     """
     count = len(knots) - degree - 1
     matrix = np.eye(count)
@@ -339,7 +335,7 @@ def end_change_matrix(knots: Array, degree: int, new_knots: Array) -> Array:
 
 
 def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
-    """Return the weights (p + 1,) of a span's control points in its blossom, by de Boor's recurrence."""
+    """Weights (p + 1,) of a span's control points in its blossom, by de Boor's recurrence."""
     weights = np.eye(degree + 1)
     for r, x in enumerate(arguments, start=1):
         lower = knots[span - degree + r : span + 1]
@@ -350,21 +346,21 @@ def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return the scalar products (k,) of plane vectors (k, 2)."""
+    """Scalar products (k,) of plane vectors (k, 2)."""
     return np.asarray(np.einsum("kd,kd->k", a, b))
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return the cross products (...) of plane vectors (..., 2)."""
+    """Cross products (...) of plane vectors (..., 2)."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
 def side_of(p: Array, q: Array, point: Array) -> Array:
-    """Return on which side of the lines from p to q (..., 2) the points lie: positive on the left."""
+    """Side of points relative to the lines from p to q (..., 2): positive on the left."""
     return cross(q - p, point - p)
 
 
 def segments_cross(p: Array, q: Array, r: Array, s: Array) -> BoolArray:
-    """Return whether the segments from p to q cross those from r to s (..., 2)."""
+    """Whether the segments from p to q cross those from r to s (..., 2)."""
     r_apart_s, p_apart_q = side_of(p, q, r) * side_of(p, q, s), side_of(r, s, p) * side_of(r, s, q)
     return np.asarray((r_apart_s < 0.0) & (p_apart_q < 0.0))

@@ -1,6 +1,6 @@
-"""The centre line between two boundaries: the curve whose normals cross them equally far to both sides.
+"""The centre line between two boundaries: the curve whose normals cross both at equal distances.
 
-It is kept as a ribbon, one B-spline of the centre line and half the width.
+It is represented as a ribbon, one B-spline of the centre line and half the width.
 """
 
 from dataclasses import dataclass, replace
@@ -20,16 +20,16 @@ from pathspace_graph.labels import LEFT, RIGHT
 from .bspline import BSpline, dot, segments_cross
 
 RIBBON: Final = 3  # entries of a ribbon's control point: x, y (m, map frame) and half the width h (m)
-SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}  # side of the centre line on which the edge of each label is
-SAMPLE_STEP: Final = 0.5  # distance of the samples of boundaries, of lines, and of edges that are fitted (m)
-_EDGE_BREAKS: Final = 2  # knot intervals of an edge for each of the ribbon: it is no B-spline itself
+SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}  # side of the centre line of each label's edge
+SAMPLE_STEP: Final = 0.5  # distance of the samples of boundaries, lines and fitted edges (m)
+_EDGE_BREAKS: Final = 2  # knot intervals of a fitted edge for each of the ribbon; an edge is no B-spline
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ribbon(BSpline):
-    """A spline (x, y, h)(u) = sum_j N_j(u) c_j, with C = (x, y) and the edges C + h n and C - h n.
+    """A spline (x, y, h)(u) = sum_j N_j(u) c_j with the centre C = (x, y) and the edges C + h n and C - h n.
 
-    Its parameter is about a length (m) along the line; h is half the width (m).
+    The parameter is about the length (m) along the line; h is half the width (m).
     """
 
     DIMENSION = RIBBON
@@ -39,7 +39,7 @@ class Ribbon(BSpline):
         return BSpline.on(self.tables, self.control_points[:, :2])
 
     def half_width(self, u: Array) -> Array:
-        """Return half the width (k,) of the track in m."""
+        """Half the width (k,) of the track, in m."""
         return np.asarray(self.evaluate(u)[:, 2])
 
     @cached_property
@@ -73,7 +73,7 @@ class Ribbon(BSpline):
         return at[:, :2] + half[:, None] * n, by_control.reshape(len(u), 2, -1)
 
     def edge_spline(self, label: int) -> tuple[BSpline, Array]:
-        """Return an edge as a B-spline of m' control points, and their derivatives (2m', 3m)."""
+        """Fit an edge by a B-spline of m' control points; return it and their derivatives (2m', 3m)."""
         low, high = self.domain
         blank = BSpline.even(low, high, _EDGE_BREAKS * len(self.tables.starts), self.periodic, self.degree)
         steps = int(np.ceil((high - low) / SAMPLE_STEP))
@@ -86,34 +86,34 @@ class Ribbon(BSpline):
 
 # --- the line between two boundaries ---------------------------------------------------------------------
 
-RIBBON_SPACING: Final = 3.0  # of the knots of a planner's line (m); shorter kinks are smoothed
-MOST_SAMPLES: Final = 200_000  # largest number of samples of a boundary, which bounds the memory
+RIBBON_SPACING: Final = 3.0  # distance of the knots of a planner's line (m); shorter kinks are smoothed
+MOST_SAMPLES: Final = 200_000  # largest number of samples of a boundary; bounds the memory
 _FEWEST_SPANS: Final = 4  # smallest number of samples of a boundary and of knot intervals of a line
-_PAIR_STARTS: Final = 200  # number of samples of the left boundary among which the march begins
-_PAIRS_NEAR: Final = 12  # distance in samples from a pair within which segments are tested for a crossing
-_RIBBON_ROUNDS: Final = 3  # moves of the line to the middle between the crossings of its normals
-_RIBBON_SMOOTHNESS: Final = 1e-3  # weight of second differences, for what the samples leave open
+_PAIR_STARTS: Final = 200  # number of samples of the left boundary tried as the start of the march
+_PAIRS_NEAR: Final = 12  # samples on either side of a pair in which segments are tested for a crossing
+_RIBBON_ROUNDS: Final = 3  # number of moves of the line to the middle between the crossings of its normals
+_RIBBON_SMOOTHNESS: Final = 1e-3  # weight of second differences, where samples do not determine the fit
 _CROSSING_STEPS: Final = 8  # number of Newton steps to the crossing of a normal and a boundary
-_CROSSED: Final = 1e-6  # distance of the point found from a boundary below which a normal crosses it (m)
+_CROSSED: Final = 1e-6  # tolerance of a point where a normal crosses a boundary (m)
 _LEAST_COSINE: Final = 0.1  # least cosine of the angle between boundary and line at a crossing
-_FARTHEST_ACROSS: Final = 1.5  # of a crossing over the paired sample; beyond, it is of another stretch
+_FARTHEST_ACROSS: Final = 1.5  # largest distance of a crossing, relative to the paired sample's
 
 
 @dataclass(frozen=True, eq=False)
 class CentreCurve:
-    """A ribbon between two boundaries, with samples that lead from its parameter to theirs."""
+    """A ribbon between two boundaries, with samples that map its parameter to theirs."""
 
     ribbon: Ribbon
-    u: Array  # (k,) parameters of the ribbon, about evenly spaced; those of a loop end before its beginning
+    u: Array  # (k,) parameters of the ribbon, about evenly spaced; on a loop without the repeated first one
     sides: tuple[BSpline, BSpline]  # left and right boundary
-    beside: tuple[Array, Array]  # (k,) their parameters beside each sample, not wrapped
+    beside: tuple[Array, Array]  # (k,) parameters of the boundaries beside each sample, not wrapped
 
     @property
     def size(self) -> int:
         return self.sides[0].size + self.sides[1].size
 
     def table(self, side: int) -> Array:
-        """Return the pairs (n, 2) of parameters of a boundary, ascending, and of the ribbon, once round."""
+        """Pairs (n, 2) of parameters of a boundary, ascending, and of the ribbon; over a whole loop."""
         u, own = self.u, self.beside[side]
         if self.ribbon.periodic:
             (low, high), (begin, end) = self.sides[side].domain, self.ribbon.domain
@@ -121,7 +121,7 @@ class CentreCurve:
         return np.column_stack([np.maximum.accumulate(own), u])
 
     def ribbon_parameters(self, side: int, u: Array) -> Array:
-        """Return the parameters (k,) of the ribbon beside the parameters u (k,) of a boundary."""
+        """Parameters (k,) of the ribbon beside the parameters u (k,) of a boundary."""
         table = self.table(side)
         if self.ribbon.periodic:
             low, high = self.sides[side].domain
@@ -129,7 +129,7 @@ class CentreCurve:
         return np.interp(u, table[:, 0], table[:, 1])
 
     def crossings(self, at: Array) -> "list[Crossing]":
-        """Return where the normals at parameters `at` (k,) of the ribbon cross each boundary."""
+        """Find where the normals at parameters `at` (k,) of the ribbon cross each boundary."""
         points, tangent = self.ribbon.centre.evaluate(at), self.ribbon.centre.tangent_unit(at)
         normal, half = left_of(tangent), self.ribbon.half_width(at)
         found = []
@@ -153,10 +153,10 @@ class CentreCurve:
 
     @cached_property
     def by_boundaries(self) -> Array:
-        """Derivatives (3m, 2M) of the ribbon's control points by the M of both boundaries, left ones first.
+        """Derivatives (3m, 2M) of the ribbon's control points by the M of both boundaries, left first.
 
-        At fixed normals a crossing moves by N . dS / (N . n) along the normal n, where N is the normal of its
-        boundary. The line follows the mean of both, half the width half the difference.
+        At fixed normals a crossing moves by `N . dS / (N . n)` along the normal n, where N is the normal of
+        the boundary. The line moves by the mean of both, half the width changes by half the difference.
         """
         left, right = self.crossings(self.u)
         moves = left.along_normal(0, self.size), right.along_normal(left.spline.size, self.size)
@@ -173,10 +173,10 @@ class Crossing:
     """The points where normals of a line cross a boundary."""
 
     spline: BSpline
-    u: Array  # (k,) parameters of the boundary, not wrapped; of the sample beside where a normal misses it
+    u: Array  # (k,) parameters of the boundary, not wrapped; those of the paired samples if not `good`
     normal: Array  # (k, 2) unit normals of the line, to the left
     offset: Array  # (k,) signed distance along the normal, positive to the left (m)
-    good: BoolArray  # (k,) whether the normal crosses the boundary there
+    good: BoolArray  # (k,) whether the normal crosses the boundary
 
     @cached_property
     def own_normal(self) -> Array:
@@ -185,18 +185,18 @@ class Crossing:
         return np.asarray(own / np.maximum(dot(own, self.normal), _LEAST_COSINE)[:, None])
 
     def along_normal(self, first: int, size: int) -> csr_array:
-        """Return the derivatives (k, 2s) of the offset by control points, its boundary's from `first` on."""
+        """Derivatives (k, 2s) of the offset by all s control points; the boundary's begin at `first`."""
         values, columns = self.spline.local_basis(self.u)
         entries = values[:, :, None] * self.own_normal[:, None, :]
         return sparse_rows(entries, 2 * (columns + first)[:, :, None] + np.arange(2), 2 * size)
 
 
 def find_line(left: BSpline, right: BSpline, spacing: float = RIBBON_SPACING) -> CentreCurve:
-    """Return the line between two boundaries, on knots about `spacing` (m) apart.
+    """Find the line between two boundaries, on knots about `spacing` (m) apart.
 
     Samples of both are paired along the strip between them, always over the shorter diagonal. A ribbon is
-    fitted to the middles, then to the middles between the crossings of its normals with the boundaries. An
-    open line ends where both end. SettingsError where a boundary is too long, or they cross or change sides.
+    fitted to the midpoints, then to the midpoints between the crossings of its normals with the boundaries.
+    An open line ends where both end. SettingsError if a boundary is too long, or if they cross or swap sides.
     """
     longest = max(left.length(), right.length())
     if not longest <= MOST_SAMPLES * SAMPLE_STEP:
@@ -216,7 +216,7 @@ def find_line(left: BSpline, right: BSpline, spacing: float = RIBBON_SPACING) ->
     beside = np.interp(u, lengths, first), np.interp(u, lengths, second)
     fit = _Fit(blank, u)
     line = CentreCurve(blank.with_points(fit.solve(middles)), u, (left, right), beside)
-    for _ in range(_RIBBON_ROUNDS):  # to the middle between its normals' crossings, where they cross both
+    for _ in range(_RIBBON_ROUNDS):
         one, other = line.crossings(u)
         good = one.good & other.good
         middle = 0.5 * (one.offset + other.offset)[:, None] * one.normal + line.ribbon.centre.evaluate(u)
@@ -228,7 +228,7 @@ def find_line(left: BSpline, right: BSpline, spacing: float = RIBBON_SPACING) ->
 
 
 class _Fit:
-    """The least-squares fit of a ribbon's control points to values at parameters u (k,)."""
+    """Least-squares fit of a ribbon's control points to values at parameters u (k,)."""
 
     def __init__(self, ribbon: Ribbon, u: Array) -> None:
         self._basis = sparse_rows(*ribbon.local_basis(u), ribbon.size)
@@ -242,7 +242,7 @@ class _Fit:
 
 
 def sparse_rows(values: Array, columns: IntArray, size: int) -> csr_array:
-    """Return the matrix (k, size) of the values (k, ...) of each row in these columns."""
+    """Build a sparse matrix (k, size) from the values (k, ...) and columns of each row."""
     ends = np.arange(len(values) + 1) * (values.size // len(values))
     return csr_array((values.ravel(), columns.ravel(), ends), shape=(len(values), size))
 
@@ -251,7 +251,7 @@ def sparse_rows(values: Array, columns: IntArray, size: int) -> csr_array:
 
 
 class _Sampled:
-    """A boundary at places about `SAMPLE_STEP` apart; those of a loop end before its beginning."""
+    """Samples of a boundary about `SAMPLE_STEP` apart; on a loop without the repeated first one."""
 
     def __init__(self, spline: BSpline) -> None:
         self.spline, self.length = spline, spline.length()
@@ -264,21 +264,21 @@ class _Sampled:
         return len(self.u)
 
     def at(self, indices: IntArray) -> tuple[Array, Array]:
-        """Return points (k, 2) and parameters (k,) of samples, whose indices go on past the end of a loop."""
+        """Return points (k, 2) and parameters (k,) of samples; indices continue past the end of a loop."""
         low, high = self.spline.domain
         around, own = np.divmod(indices, len(self))
         return self.points[own], self.u[own] + (high - low) * around
 
 
 def _paired(one: _Sampled, other: _Sampled) -> tuple[IntArray, IntArray]:
-    """Return the samples of both boundaries that face each other, in the direction of travel."""
+    """Pair the samples of both boundaries that face each other, in driving order."""
     i, j = _first_pair(one, other)
     lefts, rights = ([tuple(point) for point in side.points.tolist()] for side in (one, other))
     if one.spline.periodic:
         lefts, rights = lefts[i:] + lefts[: i + 1], rights[j:] + rights[: j + 1]
         ahead = np.array(_march(lefts, rights, True))
         left, right = ahead[:, 0] + i, ahead[:, 1] + j
-        # the line begins beside the beginning of the left boundary, whichever pair is the nearest
+        # begin the line at the first sample of the left boundary, not at the nearest pair
         begin = int(np.argmax(left >= len(one)))
         left = np.append(left[begin:-1] - len(one), left[: begin + 1])
         right = np.append(right[begin:-1], right[: begin + 1] + len(other))
@@ -290,7 +290,7 @@ def _paired(one: _Sampled, other: _Sampled) -> tuple[IntArray, IntArray]:
 
 
 def _first_pair(one: _Sampled, other: _Sampled) -> tuple[int, int]:
-    """Return the nearest pair of samples that face each other, the left one on the left."""
+    """Find the nearest pair of samples that face each other, the left one on the left."""
     some = np.unique(np.linspace(0, len(one) - 1, _PAIR_STARTS).astype(int))
     points = one.points[some], other.points
     tangents = one.spline.tangent_unit(one.u)[some], other.spline.tangent_unit(other.u)
@@ -299,7 +299,7 @@ def _first_pair(one: _Sampled, other: _Sampled) -> tuple[int, int]:
     apart = np.inf if one.spline.periodic else 0.5 * min(one.length, other.length)
     i, j = points_across(points, tangents, lengths, apart)
     if not len(i):
-        raise SettingsError("expected the left boundary to the left of the right one, found none such")
+        raise SettingsError("expected the left boundary to the left of the right one, found no such place")
     best = int(((points[0][i] - points[1][j]) ** 2).sum(axis=1).argmin())
     return int(some[i[best]]), int(j[best])
 
@@ -307,10 +307,10 @@ def _first_pair(one: _Sampled, other: _Sampled) -> tuple[int, int]:
 def points_across(
     points: tuple[Array, Array], tangents: tuple[Array, Array], lengths: tuple[Array, Array], apart: float
 ) -> tuple[IntArray, IntArray]:
-    """Return the samples of the first curve that have a point across, and that sample of the second curve.
+    """Return the samples of the first curve that have a sample of the second across, and these samples.
 
-    The point across is the nearest one to the right of the first curve, which is to the left of the second
-    and goes the same way. Their arc lengths differ by at most `apart` (m).
+    The sample across is the nearest one to the right of the first curve that has the first curve on its left
+    and the same direction. Their arc lengths differ by at most `apart` (m).
     """
     normals = left_of(tangents[0]), left_of(tangents[1])
     square = ((points[0][:, None] - points[1]) ** 2).sum(axis=2)
@@ -325,7 +325,7 @@ def points_across(
 def _march(
     lefts: list[tuple[float, ...]], rights: list[tuple[float, ...]], to_the_end: bool
 ) -> list[tuple[int, int]]:
-    """Return the pairs of a march along two rows, which always goes on over the shorter diagonal."""
+    """March along two rows, always over the shorter diagonal; return the pairs passed."""
     i = j = 0
     pairs = [(0, 0)]
     last = len(lefts) - 1, len(rights) - 1
@@ -348,7 +348,7 @@ def _square(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 
 
 def _check_apart(lefts: Array, rights: Array, i: IntArray, j: IntArray, closed: bool) -> None:
-    """Raise a SettingsError where the boundaries cross near a pair of samples that face each other."""
+    """Raise a SettingsError if the boundaries cross near a pair of samples that face each other."""
     mode: Literal["wrap", "clip"] = "wrap" if closed else "clip"
     near = j[:, None] + np.arange(-_PAIRS_NEAR, _PAIRS_NEAR + 1)
     p, q = (lefts.take(i[:, None] + k, axis=0, mode=mode) for k in range(2))

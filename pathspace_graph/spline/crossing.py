@@ -1,6 +1,7 @@
-"""Where a vehicle drove across the boundaries of its map, which no true boundary allows.
+"""Places where the path driven crosses a boundary of the map: the map is wrong there.
 
-All limits are shares of the usual distance of the boundaries from the drive, so they fit scenes of any size.
+All limits are relative to the median distance of the boundaries from the drive, so they fit scenes of any
+size.
 """
 
 from collections.abc import Mapping
@@ -19,47 +20,47 @@ from pathspace_graph.lengths import Length, Text
 from .boundary import crossing_segments
 from .bspline import BSpline, cross, dot
 
-COARSE: Final = 8  # number of points for each control point by which the usual distance is found
+COARSE: Final = 8  # number of samples for each control point, for the median distance
 CROSSING_STEP: Final = 0.15  # distance of the samples of curves and drive
-DRIVE_GAP: Final = 5.0  # step of a drive beyond which it is not known between two poses
-CROSSED_DEPTH: Final = 0.35  # how far behind a boundary the vehicle is across it: drivers cut corners
-ROADSIDE: Final = 2.5  # farthest that the boundary of a road lies from the drive along it
+DRIVE_GAP: Final = 5.0  # longest step of a drive between two poses; beyond, the path between is unknown
+CROSSED_DEPTH: Final = 0.35  # least depth beyond a boundary that counts as across: drivers cut corners
+ROADSIDE: Final = 2.5  # largest distance of a road's boundary from the drive along it
 PASSES_APART: Final = 15.0  # least length driven between two passes of one place
-ALONG_COSINE: Final = 0.9  # least cosine of the angle of a boundary and the drive along it
-PARTED_COSINE: Final = 0.87  # largest cosine of the angle of two ways that cross
-MEETING_REACH: Final = 7.0  # how near to such a place boundaries may be crossed
-MEETING_DISTANCE: Final = 0.5  # largest distance of two ways that cross
-MEETING_SAMPLES: Final = 500  # most samples of the drive that are looked at there
-ON_ROAD_SHARE: Final = 0.5  # share of a stretch with another boundary beside it from which it is on the road
+ALONG_COSINE: Final = 0.9  # least cosine of the angle between a boundary and the drive along it
+PARTED_COSINE: Final = 0.87  # largest cosine of the angle between two parts of the drive that cross
+MEETING_REACH: Final = 7.0  # distance from such a crossing within which boundaries may be crossed
+MEETING_DISTANCE: Final = 0.5  # largest distance of two parts of the drive that cross
+MEETING_SAMPLES: Final = 500  # largest number of samples of the drive tested there
+ON_ROAD_SHARE: Final = 0.5  # least share of a stretch on the road that has another boundary beside it
 
 
 class Crossing(NamedTuple):
-    """A place where the vehicle drove across a boundary of its map."""
+    """A place where the vehicle crossed a boundary of the map."""
 
     label: int
     place: Array  # (2,) in m, map frame
-    driven: float  # length of the drive up to there (m)
+    driven: float  # length of the drive up to this place (m)
 
 
 def crossings_told(found: list[Crossing]) -> str:
-    """Return where the vehicle drove across boundaries in words; empty where it did not."""
+    """Describe where the vehicle crossed boundaries; empty without a crossing."""
     if not found:
         return ""
     first, more = found[0], f", and at {len(found) - 1} more" if len(found) > 1 else ""
     x, y, driven = map(Length, (*first.place.tolist(), first.driven))
     return Text(
-        "the {name} boundary lies across the way driven at x = {x:.3g} m, y = {y:.3g} m, after {driven:.3g} m"
-        "{more}",
+        "the {name} boundary lies across the driven path at x = {x:.3g} m, y = {y:.3g} m, after "
+        "{driven:.3g} m{more}",
         **{"name": NAMES[first.label], "x": x, "y": y, "driven": driven, "more": more},
     )
 
 
 def crossed_boundaries(curves: Mapping[int, BSpline], path: Array) -> list[Crossing]:
-    """Return where a vehicle on a path (n, 2) drove across the boundaries of its map, in the order driven.
+    """Find where a path driven (n, 2) crosses the boundaries of the map, in driving order.
 
-    It does not where it cuts a corner, where it comes onto the road or leaves it for good, and where it
-    meets another part of its own way: roads that cross have boundaries there, and the laps of an open map
-    may lie beside each other.
+    Not counted: a corner that is cut; the place where the vehicle enters or finally leaves the road; a place
+    where the path crosses itself, since roads that cross have boundaries there; and the boundary of another
+    lap of an open map, whose laps may lie beside each other.
     """
     moves = (np.diff(path, axis=0) != 0.0).any(axis=1)
     path = path[np.append(moves[:1], moves)]
@@ -80,7 +81,7 @@ class _Way:
     points: Array  # (n, 2) in m, map frame
     heading: Array  # (n, 2) unit vectors
     length: Array  # (n,) length up to each sample (m)
-    pieces: list[slice]  # samples between which nothing is missing
+    pieces: list[slice]  # stretches without a gap
     closed: bool = False
 
 
@@ -104,12 +105,12 @@ def _drive(path: Array, aside: float) -> _Way:
 
 
 def _crossings(label: int, lines: Mapping[int, _Way], drive: _Way, aside: float) -> list[Crossing]:
-    """Return the crossings of one boundary."""
+    """Find the crossings of one boundary."""
     line, found = lines[label], []
     distance, foot = map(np.asarray, KDTree(line.points).query(drive.points))
     inside = (foot > 0) & (foot < len(line.points) - 1)
     depth = CROSSED_DEPTH * aside
-    deep = (line.closed | inside) & (distance > depth)  # nothing is beside a curve that has ended
+    deep = (line.closed | inside) & (distance > depth)  # no sample is beside a curve beyond its end
     reaches = np.asarray(KDTree(drive.points).query(line.points)[0]) > depth
     for piece in drive.pieces:
         rows, at, share = crossing_segments(drive.points[piece], line.points)
@@ -135,7 +136,7 @@ def _crossings(label: int, lines: Mapping[int, _Way], drive: _Way, aside: float)
 
 
 def _between(first: int, second: int, line: _Way) -> IntArray:
-    """Return the samples of a curve between two of them, by the shorter way around a closed one."""
+    """Samples of a curve between two of its samples, the shorter way around a closed one."""
     low, high = sorted((first, second))
     rows = np.arange(low + 1, high + 1)
     around = np.append(np.arange(high + 1, len(line.points)), np.arange(low + 1))
@@ -145,20 +146,20 @@ def _between(first: int, second: int, line: _Way) -> IntArray:
 def _changes(deep: set[int]) -> list[int]:
     """Return the crossings after which the vehicle is on the other side of a curve.
 
-    `deep` are the parts of the drive between crossings, each by the number of crossings before it, in which
-    drive and curve part. From one of them to the next, an odd number of crossings changes the side.
+    `deep` are the parts of the drive, by the number of crossings before each, in which drive and curve move
+    apart. From one to the next, an odd number of crossings changes the side.
     """
     return [a for a, b in pairwise(sorted(deep)) if (b - a) % 2]
 
 
 def _is_off_road(label: int, lines: Mapping[int, _Way], drive: _Way, beyond: slice, aside: float) -> bool:
-    """Return whether the drive beyond a boundary is along no other one, as where it comes onto the road."""
+    """Whether the drive beyond a boundary is along no other boundary, as before it enters the road."""
     others = [_beside(other, line, drive, beyond, aside) for other, line in lines.items() if other != label]
     return bool(others) and max(float(one.mean()) for one in others) < ON_ROAD_SHARE
 
 
 def _beside(label: int, line: _Way, drive: _Way, rows: slice, aside: float) -> BoolArray:
-    """Return whether a boundary lies beside each sample (m,) of a stretch of the drive, on its own side."""
+    """Whether a boundary lies beside each sample (m,) of a stretch of the drive, on its own side."""
     distance, foot = map(np.asarray, KDTree(line.points).query(drive.points[rows]))
     heading, off = drive.heading[rows], line.points[foot] - drive.points[rows]
     on_side = (cross(heading, off) > 0.0) == (label == LEFT)
@@ -167,7 +168,7 @@ def _beside(label: int, line: _Way, drive: _Way, rows: slice, aside: float) -> B
 
 
 def _meets_itself(place: Array, drive: _Way, aside: float) -> bool:
-    """Return whether the way crosses another part of itself near a place (2,)."""
+    """Whether the drive crosses itself near a place (2,)."""
     near = np.flatnonzero(np.hypot(*(drive.points - place).T) < MEETING_REACH * aside)
     near = near[:: 1 + len(near) // MEETING_SAMPLES]
     points, heading, length = drive.points[near], drive.heading[near], drive.length[near]
@@ -178,7 +179,7 @@ def _meets_itself(place: Array, drive: _Way, aside: float) -> bool:
 
 
 def _is_of_another_lap(one: Crossing, heading: Array, drive: _Way, aside: float) -> bool:
-    """Return whether a boundary with a heading (2,) lies beside another part of the way, on its own side."""
+    """Whether a boundary with a heading (2,) lies beside another part of the drive, on its own side."""
     off = one.place - drive.points
     across = cross(drive.heading, off) * (1.0 if one.label == LEFT else -1.0)
     beside = (across > CROSSED_DEPTH * aside) & (across < ROADSIDE * aside)

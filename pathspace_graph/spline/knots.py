@@ -1,4 +1,4 @@
-"""Knots by curvature (paper: Simplification) or by the cones, and fits and refits on them."""
+"""Knots by curvature (paper: Simplification) or by cones, and fits and refits on them."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,20 +14,22 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.spline.bspline import BSpline
 
-CUBIC: Final = 3  # of a curve, where none is given
-LINEAR_BASELINE: Final = 0.5  # share in [0, 1] of the knots that is spread evenly, for straights
-CURVATURE_MAX: Final = 0.7  # that larger ones count as (1/m), so that a kink does not attract all knots
-ENERGY_WEIGHT: Final = 1e-3  # weight (m^3) of the integral of |S''|^2 beside the sum of squared distances
-KNOT_ROUNDS: Final = 4  # times that a fit's knots are placed anew by curvature, after evenly spaced ones
+CUBIC: Final = 3  # default degree
+LINEAR_BASELINE: Final = 0.5  # share in [0, 1] of evenly spread knots, for straights
+CURVATURE_MAX: Final = 0.7  # limit of the curvature (1/m), so that a kink does not attract all knots
+ENERGY_WEIGHT: Final = (
+    1e-3  # weight (m^3) of the integral of |S''|^2, relative to the squared distances (m^2)
+)
+KNOT_ROUNDS: Final = 4  # placements of a fit's knots by curvature, after evenly spaced ones
 REFITS: Final = 4  # least-squares fits on each set of knots, with refreshed foot points
-_SAMPLES_PER_BREAK: Final = 40  # equally spaced samples of the curvature for each requested break
-_SAMPLES_PER_SPAN: Final = 8  # least-squares samples of a refit on each span: enough for any degree up to 7
+_SAMPLES_PER_BREAK: Final = 40  # equally spaced samples of the curvature for each break
+_SAMPLES_PER_SPAN: Final = 8  # least-squares samples of a refit on each span; enough up to degree 7
 _BRIDGE: Final = 1e-3  # weight of second derivatives on spans with too few samples of a refit
-_BENDING_PER_SPAN: Final = 3  # places on each such span at which the second derivative is taken
+_BENDING_PER_SPAN: Final = 3  # points of the second derivative on each such span
 
 
 def quantile_breaks(u: Array, curvature: Array, count: int, baseline: float = LINEAR_BASELINE) -> Array:
-    """Return breaks (count + 1,) at equal quantiles of (1 - b) |kappa| / sum |kappa| + b / N.
+    """Place breaks (count + 1,) at equal quantiles of `(1 - b) |kappa| / sum |kappa| + b / N`.
 
     The N equally long intervals between parameters u (N + 1,) have curvature kappa (N,) in 1/m; b is the
     linear baseline. SettingsError if `count` is less than 1.
@@ -50,10 +52,10 @@ def curvature_weighted_breaks(
     low: float | None = None,
     high: float | None = None,
 ) -> Array:
-    """Return breaks (count + 1,) in the spline's own parameter between low and high (default: its domain).
+    """Place breaks (count + 1,) in the spline's parameter between low and high (default: its domain).
 
-    The curvature at equal distances, plus the linear baseline, is a density, and the knots are its quantiles
-    (paper: Simplification). An open curve is straight beyond its ends. SettingsError on an empty stretch.
+    They are the quantiles of a density: the curvature at equal distances, plus the linear baseline (paper:
+    Simplification). An open curve is straight beyond its ends. SettingsError on an empty stretch.
     """
     first, last = spline.domain
     low, high = first if low is None else low, last if high is None else high
@@ -68,7 +70,7 @@ def curvature_weighted_breaks(
 
 
 def _equal_lengths(spline: BSpline, low: float, high: float, count: int) -> Array:
-    """Return parameters (count + 1,) from low to high at equal distances, extrapolated beyond an end."""
+    """Parameters (count + 1,) from low to high at equal distances, extrapolated beyond an end."""
     first, last = spline.domain
     grid = np.linspace(low, high, 4 * count + 1)
     chords = np.linalg.norm(np.diff(spline.evaluate(grid), axis=0), axis=1)
@@ -82,7 +84,7 @@ def _equal_lengths(spline: BSpline, low: float, high: float, count: int) -> Arra
 
 @dataclass(frozen=True, eq=False)
 class Refit:
-    """Change of basis between an old and a new spline; it is the same for both coordinates."""
+    """Change of basis between an old and a new spline, the same for both coordinates."""
 
     new_from_old: Array  # (m_new, m_old) F of the least-squares fit C_new = F C_old
     old_from_new: Array  # (m_old, m_new) E of the least-squares fit C_old ~ E C_new
@@ -94,11 +96,10 @@ def refit(
     u_map: Callable[[Array], Array] | None = None,
     within: tuple[float, float] = (-np.inf, np.inf),
 ) -> Refit:
-    """Fit the bases of two splines to each other; only the knots of `new` are used, not its control points.
+    """Fit the bases of two splines to each other; the control points of `new` are not used.
 
-    `u_map` maps increasing parameters of the old to those of the new one (default: the same). Where the new
-    domain has no sample, F fills the gap smoothly. What is not `within` these old parameters counts for E
-    only.
+    `u_map` maps increasing parameters of the old to the new spline (default: the same). F is smooth over gaps
+    without samples in the new domain. Old parameters that are not `within` the limits count for E only.
     """
     finer = int(np.ceil(np.diff(old.breaks).max() / np.diff(new.breaks).min()))
     u = _on_spans(old, _SAMPLES_PER_SPAN * min(max(1, finer), _SAMPLES_PER_SPAN))
@@ -125,14 +126,14 @@ def refit(
 
 
 def _product(a: tuple[Array, IntArray], b: tuple[Array, IntArray], shape: tuple[int, int]) -> Array:
-    """Return A' B of the basis matrices (k, m) and (k, n) whose rows have local values and their columns."""
+    """Compute A' B of basis matrices (k, m) and (k, n), each given by local values and their columns."""
     at = a[1][:, :, None] * shape[1] + b[1][:, None, :]
     weights = a[0][:, :, None] * b[0][:, None, :]
     return np.asarray(np.bincount(at.ravel(), weights.ravel(), shape[0] * shape[1]).reshape(shape), float)
 
 
 def _normal_solution(normal: Array, right: Array) -> Array:
-    """Return N^+ R of normal equations, which a sampled B-spline basis keeps well conditioned."""
+    """Solve normal equations for `N^+ R`; a well-sampled B-spline basis is well conditioned."""
     try:
         factor = cho_factor(normal, check_finite=False)
     except np.linalg.LinAlgError:
@@ -141,14 +142,14 @@ def _normal_solution(normal: Array, right: Array) -> Array:
 
 
 def _bending_rows(spline: BSpline) -> Array:
-    """Return rows whose product with the control points is h^2 S'' at places on every span of width h."""
+    """Rows whose product with the control points is h^2 S'' at points on every span of width h."""
     width, order = np.diff(spline.breaks), min(2, spline.degree)
     scale = np.repeat(width, _BENDING_PER_SPAN) ** order
     return np.asarray(spline.basis_matrix(_on_spans(spline, _BENDING_PER_SPAN), order) * scale[:, None])
 
 
 def _on_spans(spline: BSpline, count: int) -> Array:
-    """Return `count` parameters in each span of a spline, evenly spaced."""
+    """Evenly spaced parameters, `count` in each span of a spline."""
     offsets = (np.arange(count) + 0.5) / count
     return (spline.breaks[:-1, None] + np.diff(spline.breaks)[:, None] * offsets).ravel()
 
@@ -158,9 +159,9 @@ def fit_spline(
 ) -> BSpline:
     """Fit a spline of `size` distinct control points to ordered points (k, 2) in m, by least squares.
 
-    Parameters move from chord lengths to the foot points, knots to the curvature unless `breaks` are given,
-    and the fit with the smallest rmse is returned. Bending energy makes two points enough, or three on a
-    loop. SettingsError where there are fewer, or too few control points for the degree.
+    Parameters begin at chord lengths and move to the foot points. Unless `breaks` are given, knots follow the
+    curvature, and the fit with the smallest rmse is returned. With bending energy two points are enough, or
+    three on a loop. SettingsError for fewer points, or too few control points for the degree.
     """
     u, high = _chord_lengths(points, periodic)
     count = size if periodic else size - degree
@@ -201,7 +202,7 @@ def _fit_on(
 
 
 def energy_rows(spline: BSpline) -> Array:
-    """Return rows R with |R c|^2 = integral of |S''|^2 (exact up to degree 4), or of |S'|^2 for degree 1."""
+    """Rows R with `|R c|^2` the integral of |S''|^2 (exact up to degree 4), or of |S'|^2 for degree 1."""
     nodes, weights = np.polynomial.legendre.leggauss(3)
     breaks = spline.breaks
     half = 0.5 * np.diff(breaks)
@@ -210,65 +211,69 @@ def energy_rows(spline: BSpline) -> Array:
     return np.asarray(spline.basis_matrix(u, min(2, spline.degree)) * root[:, None])
 
 
-# --- knots where cones ask for them ----------------------------------------------------------------------
+# --- knots by the cones ----------------------------------------------------------------------------------
 
 
-EVEN_WEIGHT: Final = 1e-9  # weight of the square of the interval left by a removal against its cost, for ties
-SIZE_MARGIN: Final = 0.1  # least share by which a smaller curve's sum of squares must be smaller
-COINCIDENT_CONES: Final = 1e-9  # difference of parameters of cones that share one knot (m), lest 0 / 0
+EVEN_WEIGHT: Final = 1e-9  # weight of the squared interval left by a removal; decides between equal costs
+SIZE_MARGIN: Final = 0.1  # least relative gain in the sum of squares for which a smaller curve is chosen
+COINCIDENT_CONES: Final = 1e-9  # largest difference of parameters of cones that share a knot (m)
 
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
     """Least-squares spline through ordered points, after the removal of some knots."""
 
-    breaks: Array  # (b + 1,) knots that remain, in the parameter of the points (m)
-    size: int
+    breaks: Array  # (b + 1,) remaining knots, in the parameter of the points (m)
+    size: int  # number of control points
     residual: Array  # (k, 2) offset from the spline to each point, at the point's parameter (m)
-    leverage: Array  # (k,) share of each point in the curve there: the diagonal of the hat matrix
+    leverage: Array  # (k,) diagonal of the hat matrix
 
     @property
     def crossed(self) -> float:
-        """Return the sum of squares (m^2) where each point in turn is left out of the fit."""
+        """Leave-one-out sum of squares (m^2)."""
         return float(((self.residual / (1.0 - self.leverage)[:, None]) ** 2).sum())
 
 
 def chosen_breaks(points: Array, periodic: bool, degree: int, least: int, most: int) -> Thinned:
-    """Choose, among the curves of `thin` with `least` to `most` control points, by cross-validation.
+    """Choose a curve of `thin_along` with `least` to `most` control points by cross-validation.
 
-    The largest is chosen, unless a smaller one predicts a point left out better by `SIZE_MARGIN`. BIC takes a
-    knot for every cone, since rss vanishes. Knots by curvature leave 0.107 m to cones, these 0.066 m.
+    It is the largest, unless a smaller one predicts left-out points better by `SIZE_MARGIN`. BIC would take a
+    knot for every cone, since the residuals vanish. Cones are 0.066 m from the curve, 0.107 m with knots by
+    curvature.
     """
-    along = path_lengths(points)
-    high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))
-    path = list(thin(points, along, high, periodic, degree, least))
+    path = thin_along(points, periodic, degree, least)
     within = [curve for curve in path if curve.size <= most] or path[-1:]
     return min(within, key=lambda curve: (1.0 if curve is within[0] else 1.0 + SIZE_MARGIN) * curve.crossed)
 
 
 def fewest_breaks(points: Array, periodic: bool, degree: int, least: int, tolerance: float) -> Thinned:
-    """Choose the smallest curve of `thin` whose points left out are within a tolerance (m), root mean square.
+    """Choose the smallest curve of `thin_along` whose leave-one-out rms is within a tolerance (m).
 
-    It has at least `least` control points. Where none is so near, the largest is chosen.
+    It has at least `least` control points. If none is so near, the largest is chosen.
     """
-    along = path_lengths(points)
-    high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))
-    path = list(thin(points, along, high, periodic, degree, least))
+    path = thin_along(points, periodic, degree, least)
     near = [curve for curve in path if curve.crossed <= tolerance**2 * len(points)]
     return near[-1] if near else path[0]
 
 
+def thin_along(points: Array, periodic: bool, degree: int, least: int) -> list[Thinned]:
+    """Return the curves of `thin` through ordered points (k, 2), with path lengths as parameters."""
+    along = path_lengths(points)
+    high = float(along[-1] + (np.hypot(*(points[0] - points[-1])) if periodic else 0.0))
+    return list(thin(points, along, high, periodic, degree, least))
+
+
 def thin(points: Array, u: Array, high: float, periodic: bool, degree: int, least: int) -> Iterator[Thinned]:
-    """Yield least-squares curves with one knot less each, from a knot at each point down to `least` points.
+    """Yield least-squares curves from a knot at each point down to `least` control points, knot by knot.
 
-    The points (k, 2) have the parameters u (k,) in [0, high]; `least` counts control points, and where there
-    are too few points for so many, the first curve is the only one. Each step removes the knot whose removal
-    costs least; ties go to the shortest interval.
+    The points (k, 2) have the parameters u (k,) in [0, high]. If they are too few for `least` control points,
+    the first curve is the only one. Each step removes the knot whose removal costs least; ties go to the
+    shortest interval.
 
-    A knot disappears where the p-th derivative does not jump: a linear constraint a'c = 0. The removal costs
+    A knot vanishes if the p-th derivative does not jump there: a linear constraint a'c = 0. The removal costs
     `|a'c|^2 / (a' G^-1 a)`, where G is the matrix of the normal equations, and every linear function `w'c`
-    decreases by `w' G^-1 a / (a' G^-1 a) a'c`. So it suffices to update `W c` and `W G^-1 A'` by a rank of
-    one, where the rows of W are the jumps A at all knots and the basis at the points.
+    decreases by `w' G^-1 a / (a' G^-1 a) a'c`. So rank-one updates of `W c` and `W G^-1 A'` suffice, where
+    the rows of W are the jumps A at all knots and the basis at the points.
     """
     inner = np.unique(u[(u > COINCIDENT_CONES) & (u < high - COINCIDENT_CONES)])
     breaks = np.concatenate([[0.0], inner[np.diff(inner, prepend=0.0) > COINCIDENT_CONES], [high]])

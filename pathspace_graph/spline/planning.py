@@ -1,4 +1,4 @@
-"""What a planner takes of a track: a centre line with widths, curvature and sigmas, and a speed profile."""
+"""Input of a planner: a centre line with widths, curvature and sigmas, and a speed profile."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .bspline import BSpline, cross, dot
 from .centre_line import RIBBON, CentreCurve, Crossing, find_line, sparse_rows
 
 if TYPE_CHECKING:
-    import pandas as pd  # imported when it is asked for: a planner has no use for it
+    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,22 +42,23 @@ def speed_profile(
     begin: float | None = None,
     end: float | None = None,
 ) -> SpeedProfile:
-    """Return the largest speeds with v <= v_top that obey the friction ellipse,
+    """Compute the largest speeds with v <= v_top on the friction ellipse
 
         (v^2 k / a_lateral)^2 + (a / a_long)^2 <= 1,
 
-    with the curvature k and the acceleration a, which is constant from each point to the next one; each such
-    step obeys it at its slower end. a_long is `forward` or `braking`. At first v^2 = a_lateral / |k|; then a
-    forward and a backward pass bound v_next^2 by v^2 + 2 a ds (Kapania et al., J. Dyn. Syst. Meas. Control
-    138, 2016). A closed line begins and ends at the same speed, an open one at given speeds (m/s), by default
-    as fast as its curvature allows. SettingsError on fewer than two points, or on a speed that cannot be.
+    with the curvature k, and the acceleration a, constant from each point to the next one. Each such step
+    obeys it at its slower end. a_long is `forward` or `braking`. The pass of the curvature sets
+    v^2 = a_lateral / |k|; a forward and a backward pass bound v_next^2 by v^2 + 2 a ds (Kapania et al., J.
+    Dyn. Syst. Meas. Control 138, 2016). A closed line begins and ends at the same speed, an open one at the
+    given speeds (m/s), by default as fast as its curvature allows. SettingsError for fewer than two points,
+    or an impossible speed.
     """
     settings = settings or SpeedSettings()
     _check_ends(line, begin, end)
     count, steps = len(line.curvature), np.diff(line.arc_length)
     bend = np.abs(line.curvature) / settings.lateral
     squares = np.minimum(1.0 / np.maximum(bend, np.finfo(float).tiny), settings.top**2)
-    if line.closed:  # from the slowest point once round, back to it
+    if line.closed:  # begin and end at the slowest point
         first = int(squares.argmin())
         around = np.arange(first, first + count + 1) % count
         steps = np.append(steps, line.length - line.arc_length[-1])[around[:-1]]
@@ -83,14 +84,14 @@ def _check_ends(line: CentreLine | TrackAhead, begin: float | None, end: float |
     if len(line.curvature) < 2:
         raise SettingsError(f"{where} a line of at least 2 points, found {len(line.curvature)}")
     if line.closed and limits:
-        raise SettingsError(f"{where} an open line for a first or a last speed, found a loop")
+        raise SettingsError(f"{where} an open line for a begin or end speed, found a loop")
     for limit in limits:
         if not 0.0 <= limit < np.inf:
-            raise SettingsError(f"{where} a speed (m/s) from 0 on, found {limit:g}")
+            raise SettingsError(f"{where} a speed (m/s) of at least 0, found {limit:g}")
 
 
 def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Array:
-    """Return the squares (n,) of the speeds that the acceleration `most` (m/s^2) can reach, going along."""
+    """Limit squared speeds (n,) to what an acceleration of at most `most` (m/s^2) reaches along the line."""
     reached, now = squares.tolist(), float(squares[0])
     for i, (step, turn) in enumerate(zip(steps.tolist(), bend[:-1].tolist(), strict=True), 1):
         share = sqrt(max(1.0 - (now * turn) ** 2, 0.0))
@@ -99,19 +100,19 @@ def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Arra
 
 
 _FEWEST_POINTS: Final = 4  # smallest number of points of a line
-_NORMALS_APART: Final = 10  # number of points apart up to which normals must not cross
-_WIDTH_SHARE: Final = 0.95  # share of the way to where two normals would cross that is left to both widths
+_NORMALS_APART: Final = 10  # largest number of points between normals that must not cross
+_WIDTH_SHARE: Final = 0.95  # largest width, as a share of the distance to where two normals cross
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CentreLine:
-    """Centre line of a track at n points, evenly spaced, in the map frame; smooth, by `find_line`.
+    """Smooth centre line of a track (`find_line`) at n evenly spaced points, map frame.
 
-    A standard deviation is that where the line crosses its normal at the point; NaN without covariance.
+    Standard deviations are those of the point where the line crosses its normal; NaN without covariance.
     """
 
     points: Array
-    """Points (n, 2) in m; a closed line doesn't repeat the first one."""
+    """Points (n, 2) in m; a closed line does not repeat the first one."""
     heading: Array
     """Direction of travel (n,) in rad, in (-pi, pi]."""
     curvature: Array
@@ -119,13 +120,13 @@ class CentreLine:
     arc_length: Array
     """Length (n,) of the line from its first point, in m."""
     width_left: Array
-    """Distance (n,) along the normal to the left boundary (m), or less to keep off a neighbour's."""
+    """Distance (n,) along the normal to the left boundary (m); shortened if normals would cross."""
     width_right: Array
-    """Distance (n,) along the normal to the right boundary (m), or less in the same way."""
+    """Distance (n,) along the normal to the right boundary (m), shortened likewise."""
     closed: bool
     """Whether the line is a loop."""
     length: float
-    """Length of the whole line (m), the way back to the first point included where it is closed."""
+    """Length of the whole line (m); a closed one includes the way back to its first point."""
     points_sigma: Array
     """Standard deviation (n,) across the line, in m."""
     heading_sigma: Array
@@ -146,7 +147,7 @@ class CentreLine:
         return f"CentreLine({ends}, {len(self.points)} points on {self.length:.1f} m)"
 
     def to_frame(self) -> pd.DataFrame:
-        """Return the line as a frame: a row for each point, with x, y and every other array as a column."""
+        """Convert the line to a frame: one row for each point; x, y and every other array are columns."""
         columns = {"x": self.points[:, 0], "y": self.points[:, 1], **vars(self)}
         arrays = {name: v for name, v in columns.items() if isinstance(v, np.ndarray) and name != "points"}
         frame: pd.DataFrame = import_module("pandas").DataFrame(arrays)
@@ -154,10 +155,10 @@ class CentreLine:
 
 
 def centre_line(left: BSpline, right: BSpline, covariance: Array | None, step: float) -> CentreLine:
-    """Return the centre line between two boundaries at points about `step` (m) apart, see `find_line`.
+    """Compute the centre line between two boundaries at points about `step` (m) apart, see `find_line`.
 
-    The joint covariance of the control points of the left and then the right boundary, in the order x0, y0,
-    x1 and so on (m^2), is propagated to first order. SettingsError where the step is out of its range.
+    The joint covariance (m^2) of the control points, left boundary first, in the order x0, y0, x1 and so on,
+    is propagated to first order. SettingsError if the step is out of range.
     """
     check_length("step", step, LEAST_STEP)
     most, longest = MOST_POINTS * step, max(left.length(), right.length())
@@ -193,7 +194,7 @@ def centre_line(left: BSpline, right: BSpline, covariance: Array | None, step: f
 
 
 def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) -> list[Array]:
-    """Return the widths to the left and right, shortened so that no two normals of neighbours meet.
+    """Shorten the widths to the left and right, so that normals of neighbouring points do not meet.
 
     The normals p + a n and q + b m meet where a n - b m = q - p.
     """
@@ -214,10 +215,10 @@ def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) 
 
 
 def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: Array | None) -> list[Array]:
-    """Return the standard deviations (n,) across, of heading, curvature, arc length, and both widths.
+    """Standard deviations (n,) across the line, and of heading, curvature, arc length and both widths.
 
-    Each is taken where the line crosses its old normal at u (n,). There, with dC = B dc and the signed speed
-    of the shift -t . dC along the line, the derivatives by the control points of the boundaries are
+    Each is that of the point where the line crosses its old normal at u (n,). With dC = B dc, and the shift
+    -t . dC along the line, the derivatives by the control points of the boundaries are
 
         e = n . dC,   dtheta = n . dC' / |C'| - k t . dC,   ds = t . dC - t . dC(0) - integral of k e,
         do = N . dS / (N . n) + o (N . t) / (N . n) dtheta - e.
@@ -250,5 +251,5 @@ def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: 
 
 
 def _along(a: Array, moved: Array) -> Array:
-    """Return a . dC (n, M) of vectors a (n, 2) and derivatives (n, 2, M)."""
+    """Derivatives `a . dC` (n, M), of vectors a (n, 2) and derivatives (n, 2, M)."""
     return np.asarray(np.einsum("kd,kdm->km", a, moved))

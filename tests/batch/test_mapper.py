@@ -107,7 +107,7 @@ def test_the_batch_begins_online_where_odometry_leads_to_no_loop(
 
     monkeypatch.setattr(Optimizer, "find", fails_once)
     if why == "the map is objected to":
-        monkeypatch.setattr(batch_mapper, "speaks_against", lambda *_: "its boundaries cross")
+        monkeypatch.setattr(batch_mapper, "evidence_against", lambda *_: "its boundaries cross")
     result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log)
     assert result.online is not None
     assert len(searches) == (1 if why == "no cone is met again" else 2)
@@ -224,7 +224,7 @@ def test_a_map_that_lacks_the_cones_of_a_part_of_the_drive_is_objected_to() -> N
     assert unmapped(detections, poses) == ""  # false detections are everywhere
     detections.release(np.flatnonzero(late))
     said, driven = unmapped(detections, poses), path_lengths(poses)
-    assert "% of what was detected near the drive lies on no boundary" in said
+    assert "% of the detections near the drive lie on no boundary" in said
     assert 40 <= int(said.split()[0]) <= 60
     begin, end = map(float, re.findall(r"\((\S+) to (\S+) m of the drive\)", said)[0])
     assert begin == pytest.approx(driven[len(poses) // 2], abs=25.0)  # where the first stretch begins
@@ -243,9 +243,7 @@ def test_a_map_that_is_objected_to_is_written_and_reported(
         main(arguments)
     assert end.value.code == NOT_TRUSTED
     said = capsys.readouterr().err
-    assert re.search(
-        r"not a map of the drive: \d % of what was detected near the drive .* \(0 to \d+ m", said
-    )
+    assert re.search(r"not a map of the drive: \d % of the detections near the drive .* \(0 to \d+ m", said)
     assert read_map(tmp_path / "map").size > 0
 
 

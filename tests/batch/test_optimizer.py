@@ -127,7 +127,7 @@ def test_without_rounds_left_it_has_not_converged() -> None:
 def test_the_cost_never_grows_in_a_step() -> None:
     """The associations of the first round are those of the last one here, so costs can be compared."""
     system, state = noisy()
-    start = Optimizer(system).align_poses(state, 1, BATCH.gate)
+    start = Optimizer(system).align_poses(state, BATCH.gate)
     costs = []
     for rounds in (1, 2, 4, 8):
         at, _ = Optimizer(system).run(start, BATCH.gate, rounds)
@@ -160,7 +160,9 @@ def test_the_poses_alone_are_aligned_beside_the_map() -> None:
     system, truth = straight(4.0)
     shifted = truth.copy()
     shifted.variables.poses[1:, 1] += 0.3
-    aligned = Optimizer(system).align_poses(shifted, 3, LOOSE_GATE)
+    optimizer, aligned = Optimizer(system), shifted
+    for _ in range(3):
+        aligned = optimizer.align_poses(aligned, LOOSE_GATE)
     np.testing.assert_array_equal(aligned.map_points, truth.map_points)
     np.testing.assert_array_equal(aligned.variables.calibration, truth.variables.calibration)
     np.testing.assert_allclose(aligned.poses[:, 1], truth.poses[:, 1], atol=0.02)

@@ -207,7 +207,7 @@ def test_a_boundary_across_the_drive_is_told_with_its_place_and_exit_code_3(
     said = capsys.readouterr().err.splitlines()
     (line,) = [one for one in said if one.startswith("not a map of the drive")]
     assert line.endswith(
-        "the right boundary lies across the way driven at x = 12 m, y = -3.5 m, after 40 m, and at 1 more"
+        "the right boundary lies across the driven path at x = 12 m, y = -3.5 m, after 40 m, and at 1 more"
     )
     first, _ = json.loads((tmp_path / "map" / "summary.json").read_text())["crossings"]
     assert first == {"boundary": "right", "x": 12.0, "y": -3.5, "driven": 40.0}

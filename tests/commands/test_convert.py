@@ -38,7 +38,7 @@ def test_what_was_measured_is_said(
     run("online", tmp_path / "log", "--out", tmp_path / "map")
     printed = capsys.readouterr().out
     assert "measured: odometry" in printed
-    assert "the map's size is the odometry's (--calibration.trust ranges turns it round)" in printed
+    assert "the map's size is the odometry's (--calibration.trust ranges reverses that)" in printed
     summary = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert (summary["noise"]["odometry"], summary["noise"]["detections"]) == ("measured", "measured")
     assert summary["noise"]["stated"] == {}

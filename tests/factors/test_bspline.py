@@ -18,12 +18,7 @@ from pathspace_graph.factors.bspline import (
     scatter,
     uniform_knots,
 )
-from pathspace_graph.factors.footpoint import (
-    FootPoints,
-    foot_points,
-    joint_foot_points,
-    refine_joint_foot_points,
-)
+from pathspace_graph.factors.footpoint import SEARCH_ITERATIONS, FootPoints, foot_points
 from pathspace_graph.spline.bspline import end_change_matrix
 
 from ..oracles.footpoint import Stretch, curve_coefficients, stretch_of
@@ -237,14 +232,14 @@ def test_rows_of_two_curves_are_found_as_on_each_alone(periodic: bool) -> None:
     spans, together = side_by_side(tables, control)
     curve = rng.integers(0, 2, 200)
     points, u, low, high = rows(tables, curve, rng)
-    found = joint_foot_points(spans, together, points, curve, low, high, STEP)
-    refined = refine_joint_foot_points(spans, together, points, curve, u, low, high, 3)
+    found = FootPoints(*spans.search(together, points, curve, low, high, STEP, SEARCH_ITERATIONS))
+    refined = FootPoints(*spans.refine(together, points, curve, u, low, high, 3))
     for k, offset in enumerate((0, len(control[0]))):
         of, own = np.flatnonzero(curve == k), unwrapped(tables[k], control[k])
         alone = foot_points(tables[k], own, points[of], low[of], high[of], STEP)
         assert_same(found, alone, of, offset, len(control[k]))
         first, stretch = np.zeros(len(of), np.intp), (low[of], high[of])
-        alone = refine_joint_foot_points(Curves([tables[k]]), own, points[of], first, u[of], *stretch, 3)
+        alone = FootPoints(*Curves([tables[k]]).refine(own, points[of], first, u[of], *stretch, 3))
         assert_same(refined, alone, of, offset, len(control[k]))
 
 
@@ -256,7 +251,8 @@ def test_the_tail_of_an_open_curve_is_that_curve() -> None:
     high = np.full(50, tables.high)
     whole = foot_points(tables, control, points, low, high, STEP)
     laid = Curves([tables.tail(first)], [first])
-    tail = joint_foot_points(laid, control, points, np.zeros(50, np.intp), low, high, STEP)
+    stretch = low, high, STEP, SEARCH_ITERATIONS
+    tail = FootPoints(*laid.search(control, points, np.zeros(50, np.intp), *stretch))
     np.testing.assert_allclose(tail.u, whole.u, rtol=0.0, atol=1e-9)
     inside = whole.interior
     np.testing.assert_array_equal(tail.span[inside], whole.span[inside])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,7 +15,7 @@ from pathspace_graph.factors.bspline import (
     periodic_knots,
     uniform_knots,
 )
-from pathspace_graph.factors.footpoint import FootPoints, foot_points, refine_joint_foot_points
+from pathspace_graph.factors.footpoint import FootPoints, foot_points
 
 GRID = 400
 """Coarse grid steps over the domain."""
@@ -31,11 +29,11 @@ def curve_points(tables: SpanPolynomials, control_points: Array, u: Array) -> Ar
 
 
 def refine_foot_points(
-    tables: SpanPolynomials, control_points: Array, points: Array, *search: Any
+    tables: SpanPolynomials, control_points: Array, points: Array, *stretch: Array, iterations: int = 2
 ) -> FootPoints:
     """The refinement on one curve."""
     alone = np.zeros(len(points), np.intp)
-    return refine_joint_foot_points(Curves([tables]), control_points, points, alone, *search)
+    return FootPoints(*Curves([tables]).refine(control_points, points, alone, *stretch, iterations))
 
 
 def whole(tables: SpanPolynomials, control_points: Array, points: Array, step: float = 0.0) -> FootPoints:
@@ -180,9 +178,13 @@ def test_a_stretch_may_run_past_the_seam() -> None:
     feet = foot_points(tables, control_points, points, low, high, 0.3)
     np.testing.assert_allclose(feet.u, target, atol=1e-2)
     assert feet.interior.all()
-    warm = refine_foot_points(tables, control_points, points, np.array([-0.6, 16.5, 0.3]), low, high, 4)
+    warm = refine_foot_points(
+        tables, control_points, points, np.array([-0.6, 16.5, 0.3]), low, high, iterations=4
+    )
     np.testing.assert_allclose(warm.u, feet.u, atol=1e-8)
-    far = refine_foot_points(tables, control_points, points, np.array([5.0, 10.0, 2.5]), low, high, 8)
+    far = refine_foot_points(
+        tables, control_points, points, np.array([5.0, 10.0, 2.5]), low, high, iterations=8
+    )
     assert (np.mod(far.u - low, 16.0) <= 4.0 + 1e-9).all()
 
 
@@ -239,7 +241,7 @@ def test_a_warm_start_never_ends_farther_away_and_converges(seed: int) -> None:
     feet = refine_foot_points(tables, control_points, points, start, low, high)
     assert_sane(feet, tables, control_points, points)
     assert (np.linalg.norm(points - feet.position, axis=1) <= before + 1e-6).all()
-    done = refine_foot_points(tables, control_points, points, start, low, high, 60)
+    done = refine_foot_points(tables, control_points, points, start, low, high, iterations=60)
     along = np.abs(np.sum((points - done.position) * done.tangent_unit, axis=1))
     assert (along[done.interior] < 1e-6).all()
 

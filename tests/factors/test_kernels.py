@@ -210,7 +210,7 @@ def keys_to_lay_out(rng: np.random.Generator) -> tuple[Any, ...]:
 
 CASES: dict[str, Arguments] = {
     "summed": rows_of_a_system,
-    "block_of": lambda rng: ((system := rows_with_keys(rng))[0], [system[1]] * 2),
+    "blocks_of": lambda rng: ((system := rows_with_keys(rng))[0], [system[1]] * 2),
     "moved_residual": lambda rng: (*rows_with_keys(rng), rng.normal(size=30)),
     "laid_out": keys_to_lay_out,
     "columns_of": some_columns,

@@ -57,10 +57,3 @@ def test_a_copy_stays_as_it_is_and_goes_on_as_the_original() -> None:
         assert digests(copy) == digests(expected)
         for n in range(k, k + GOES_ON):
             assert digest(update(copy, cycles[n])) == readings[n]
-
-
-def test_what_a_copy_counts_is_not_counted_by_the_original() -> None:
-    original = FrontEnd(MapperSettings(), KnownNoise(np.array(ODOMETRY_SIGMA)))
-    copy = original.copy()
-    copy.gate.refuse()
-    assert (copy.gate.refused, original.gate.refused) == (1, 0)

@@ -12,10 +12,8 @@ from pathspace_graph.front_end import scan_matching
 from pathspace_graph.front_end.scan_matching import (
     LEARNED_ERRORS,
     MOST_MISFIT,
-    REACH_FIRST,
     REACH_LAST,
     REACHES,
-    REACHES_CHECK,
     SCAN_MEMORY,
     SIGMA_CONE,
     RecentDetections,
@@ -146,9 +144,3 @@ def test_remembered_detections_follow_what_is_learned_of_the_sensor() -> None:
 def test_a_detection_is_seen_again_where_one_was() -> None:
     seen = seen_once().has(np.array([[2.1, 2.0], [4.0, 0.0]]))
     np.testing.assert_array_equal(seen, [True, False])
-
-
-def test_the_reaches_shrink_from_the_first_to_the_last() -> None:
-    np.testing.assert_allclose(REACHES, 0.4 ** np.linspace(0.0, 1.0, 6))
-    assert (REACHES[0], REACHES[-1]) == (REACH_FIRST, pytest.approx(REACH_LAST))
-    assert REACHES_CHECK == (REACH_FIRST, REACH_LAST)

@@ -218,12 +218,3 @@ def test_the_derivative_by_the_bias_of_the_yaw_rate_is_the_numeric_one() -> None
     numeric = (poses(h) - poses(-h))[:n] / (2.0 * h)
     np.testing.assert_allclose(found.by_bias[:, 2], numeric[:, 2], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(found.by_bias, numeric, atol=2e-3 * np.abs(numeric).max())
-
-
-def test_tables_of_sightings_are_cut_and_put_together() -> None:
-    found = follow(drive((8.0, 0.0, 0.0), 6, np.array([[20.0, 2.0], [24.0, -2.0]])), NO_ERRORS)
-    parts = [found.where(slice(0, 5)), found.where(np.arange(5, 12)), Sightings.none()]
-    again = Sightings.stacked(parts)
-    np.testing.assert_array_equal(again.cone, found.cone)
-    np.testing.assert_array_equal(again.by_bias, found.by_bias)
-    assert len(ConeTracker(NO_ERRORS).follow([]).t) == 0

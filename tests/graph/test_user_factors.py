@@ -103,6 +103,33 @@ def straight(rng: np.random.Generator) -> Log:
     return odometry_only(np.column_stack([speeds, np.zeros((300, 2))]))
 
 
+# --- one that says nothing -------------------------------------------------------------------------------
+
+
+def everywhere(mapper: FixedLagMapper, sigma: float) -> list[gtsam.NonlinearFactor]:
+    """Priors at the origin, on the next pose and on the first control point of each curve."""
+    noise = gtsam.noiseModel.Isotropic.Sigma
+    keys = [int(mapper.control_keys(label)[0]) for label in mapper.boundaries]
+    points = [gtsam.PriorFactorPoint2(key, np.zeros(2), noise(2, sigma)) for key in keys]
+    return [gtsam.PriorFactorPose2(mapper.next_pose_key, gtsam.Pose2(), noise(3, sigma)), *points]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sigma", "says_something"), [(1e9, False), (1e3, True)])
+def test_a_factor_that_says_nothing_changes_no_bit(sigma: float, says_something: bool) -> None:
+    """The loop closes by the batch of the lap, as it does without factors."""
+    log = lap_log(bean_track(), overrun=45.0)
+    plain, given = FixedLagMapper(None, ODOMETRY_SIGMA), FixedLagMapper(None, ODOMETRY_SIGMA)
+    for odometry, cycle in split_odometry(log):
+        plain.update(odometry, cycle)
+        given.update(odometry, cycle, everywhere(given, sigma))
+    assert plain.closed
+    assert given.road.smoother.user_factors.given == says_something
+    assert (given.drive.record.unsolvable is not None) == says_something
+    points = [(plain.control_points(label), given.control_points(label)) for label in plain.boundaries]
+    assert all(np.array_equal(*pair) for pair in points) != says_something
+
+
 # --- as in a batch ---------------------------------------------------------------------------------------
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.graph.changes import restart
 from pathspace_graph.io.log import Log
-from pathspace_graph.loop.closing import hold_gauge, motion_across
+from pathspace_graph.loop.closing import fix_gauge, motion_across
 from pathspace_graph.mapping.state import State
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import split_odometry
@@ -97,7 +97,7 @@ def test_holding_moves_nothing_and_keeps_what_is_known_of_map_and_pose() -> None
     keys, rows = across(smoother.map.state)
     newest = np.array([mapper.next_pose_key - 1])
     before, of_pose = smoother.covariance(keys), smoother.covariance(newest)
-    hold_gauge(smoother)
+    fix_gauge(smoother)
     np.testing.assert_allclose(smoother.covariance(keys), before, atol=1e-6 * before.max())
     np.testing.assert_allclose(smoother.covariance(newest), of_pose, rtol=0.02, atol=1e-8)
     pinned = smoother._covariance(keys)
@@ -109,7 +109,7 @@ def test_a_step_of_a_held_map_is_that_of_a_free_one_given_that_the_whole_does_no
     smoother, free = (run(np.inf, mid()).road.smoother for _ in range(2))
     keys, C = across(smoother.map.state)
     P, before = smoother.covariance(keys), smoother.variables.of(keys)
-    hold_gauge(smoother)
+    fix_gauge(smoother)
     for one in (smoother, free):
         one.step()
     moved, expected = (one.variables.of(keys) - before for one in (smoother, free))

@@ -17,7 +17,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop import closed, map_repair
 from pathspace_graph.loop.closed import Closed
 from pathspace_graph.loop.drive import Drive
-from pathspace_graph.loop.map_repair import REPAIRED, ContradictedStretch, carried, led_through, newest_lap
+from pathspace_graph.loop.map_repair import REPAIRED, ContradictedStretch, carried, newest_lap, refitted
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online
 from pathspace_graph.sim.faults import Faults, SensorFaults
@@ -142,7 +142,7 @@ def test_a_curve_is_led_through_new_cones_and_stays_elsewhere() -> None:
     tangent = boundary.evaluate(points, u, 1)
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]]) / np.hypot(*tangent.T)[:, None]
     cones = boundary.evaluate(points, u) + 1.5 * normal
-    after = sampled(led_through(track, LEFT, [ContradictedStretch(LEFT, cones[::-1])], poses), 0.25)
+    after = sampled(refitted(track, LEFT, [ContradictedStretch(LEFT, cones[::-1])], poses), 0.25)
     nearest = np.hypot(*(after[:, None] - cones).transpose(2, 0, 1)).min(axis=0)
     assert nearest.max() < 0.3
     away = np.hypot(*(before[:, None] - cones).transpose(2, 0, 1)).min(axis=1) > 8.0
@@ -152,7 +152,7 @@ def test_a_curve_is_led_through_new_cones_and_stays_elsewhere() -> None:
 
 def test_a_curve_without_contradictions_stays_to_the_bit() -> None:
     track = repaired()[0].road.smoother.map
-    same = led_through(track, RIGHT, [ContradictedStretch(LEFT, np.zeros((3, 2)))], np.zeros((2, 3)))
+    same = refitted(track, RIGHT, [ContradictedStretch(LEFT, np.zeros((3, 2)))], np.zeros((2, 3)))
     assert (same.control_points == track.state.spline(RIGHT).control_points).all()
 
 

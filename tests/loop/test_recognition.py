@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.graph.variables import CALIBRATION_KEY, pose_keys
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.revisit import find_place, may_tell_place
+from pathspace_graph.loop.revisit import find_place, is_recognizable
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.registration import RefinedMotion
 from pathspace_graph.mapping.state import State
@@ -64,7 +64,7 @@ def test_a_lap_that_has_turned_as_a_whole_is_turned_back(laps: float) -> None:
 
 def test_a_circle_has_no_place_along_it() -> None:
     track = driven(1.3, (0.0, 0.0))
-    assert not may_tell_place(track.state, ClosingSettings())
+    assert not is_recognizable(track.state, ClosingSettings())
     assert found(track) is None
 
 
@@ -79,8 +79,8 @@ def test_a_place_farther_away_than_the_vehicle_may_be_is_none() -> None:
 
 
 def test_a_curve_of_less_than_a_lap_and_a_stretch_is_not_asked() -> None:
-    assert not may_tell_place(driven(0.4).state, ClosingSettings())
-    assert may_tell_place(driven(1.3).state, ClosingSettings())
+    assert not is_recognizable(driven(0.4).state, ClosingSettings())
+    assert is_recognizable(driven(1.3).state, ClosingSettings())
 
 
 def test_another_track_is_no_place() -> None:

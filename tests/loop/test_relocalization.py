@@ -22,7 +22,7 @@ from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.known_loop import KnownLoop, evidence_of, lay_out_loop
-from pathspace_graph.loop.relocalization import FOUND, SEARCH_MEMORY, Search, start_anew
+from pathspace_graph.loop.relocalization import FOUND, SEARCH_MEMORY, Search, restart_window
 from pathspace_graph.mapping.registration import Matches, Motion, RefinedMotion
 from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -202,7 +202,7 @@ def test_the_prior_of_a_place_that_was_found_has_three_times_the_sigmas_of_its_r
     covariance = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.002], [0.0, 0.002, 0.01]])
     nothing = Matches(np.zeros(0, np.intp), *[np.zeros(0)] * 4, np.zeros((3, 3)), np.zeros(3))  # type: ignore[arg-type]
     motion = Motion(smoother.map.state.poses[-1, :2].copy(), np.array([0.1, -0.05, 0.01]))
-    jump = start_anew(smoother, smoother.next_cycle - 5, RefinedMotion(motion, nothing, covariance))
+    jump = restart_window(smoother, smoother.next_cycle - 5, RefinedMotion(motion, nothing, covariance))
     assert np.hypot(*jump[:2]) < 0.3
     smoother.map.detections.release(np.arange(len(smoother.map.detections)))
     newest = pose_keys(np.array([smoother.next_cycle - 1]))

@@ -84,7 +84,7 @@ def test_revisits_are_as_certain_as_they_say() -> None:
 def test_the_map_is_better_for_them_and_nothing_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     mapper, results = mapped()
     truth = true_poses(drive())
-    notices = [result.notice for result in results if "met again" in result.notice]
+    notices = [result.notice for result in results if "driven before" in result.notice]
     assert len(notices) == 1 and not mapper.closed and mapper.failures == 0
     jumps = [result.jump for result in results if result.jump is not None]
     assert len(jumps) == len(mapper.revisits)

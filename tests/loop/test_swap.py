@@ -142,9 +142,9 @@ def swapped() -> tuple[Swap, OpenLap]:
     """Returns the swap of a drive, and the lap that was solved for it."""
     swaps: list[Swap] = []
     laps: list[OpenLap] = []
-    take, record = drives.go_on_from, DriveRecord.lap
+    take, record = drives.swap_in, DriveRecord.lap
 
-    def go_on_from(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
+    def swap_in(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
         jump = take(smoother, marginal)
         swaps.append(swap_of(smoother, marginal))
         return jump
@@ -154,7 +154,7 @@ def swapped() -> tuple[Swap, OpenLap]:
         return laps[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drives, "go_on_from", go_on_from)
+        patch.setattr(drives, "swap_in", swap_in)
         patch.setattr(DriveRecord, "lap", lap)
         mapper, known = open_lap()
         for odometry, detections in islice(split_odometry(log()), len(known), None):
@@ -303,7 +303,7 @@ def test_a_users_factor_on_control_points_keeps_the_prior_and_it_is_said() -> No
         results.append(mapper.update(odometry, detections, given))
     assert mapper.closed
     said = [result.notice for result in results if result.notice]
-    assert said == [HELD, f"{OWN_PRIOR}: the user's factors hold control points, which are others in a batch"]
+    assert said == [HELD, f"{OWN_PRIOR}: the user's factors hold control points, and a batch has other ones"]
     assert all(result.jump is None for result in results)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.footpoint import refine_joint_foot_points
+from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.graph.variables import CALIBRATION_KEY, control_keys, pose_keys
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
@@ -91,7 +91,7 @@ def test_foot_points_on_both_curves_are_those_on_each_alone(state: State) -> Non
     found = state.curves.find(state.map_points, points, curve, u - 3.0, u + 3.0)
     room = SplineSettings().refine_room
     stretch = u, u - room, np.minimum(u + room, state.curves.trusted[curve])
-    refined = refine_joint_foot_points(state.curves.searched, state.map_points, points, curve, *stretch)
+    refined = FootPoints(*state.curves.searched.refine(state.map_points, points, curve, *stretch, 1))
     for index, label in enumerate((LEFT, RIGHT)):
         own, boundary = curve == index, state.boundaries[label]
         control = state.control_points(label)

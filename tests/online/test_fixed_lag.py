@@ -170,13 +170,6 @@ def test_an_outline_does_not_update_the_inactive_map(
     assert_outline(track, mapper.map())  # the map has updated it, so that nothing is left moved
 
 
-def test_the_same_log_gives_the_same_map_to_the_bit(lap: Log) -> None:
-    start = replace(lap, cycles=lap.cycles[:80])
-    (first, poses), (second, again) = map_log(start), map_log(start)
-    np.testing.assert_array_equal(poses_of(poses), poses_of(again))
-    np.testing.assert_array_equal(first.road.smoother.variables.values, second.road.smoother.variables.values)
-
-
 # --- exact drives ----------------------------------------------------------------------------------------
 
 

@@ -31,7 +31,7 @@ def searched(
     coarse_step: float,
     iterations: int,
 ) -> tuple[Any, ...]:
-    """Return the fields of `joint_foot_points`."""
+    """Return the fields of `Curves.search`."""
     search = _Search.of(spans, control_points, points, curve, u_low, u_high)
     start = search.nearest_on_grid(coarse_step)
     probe = search.descend(start, np.full(len(points), coarse_step), iterations)
@@ -48,7 +48,7 @@ def refined(
     u_high: Array,
     iterations: int,
 ) -> tuple[Any, ...]:
-    """Return the fields of `refine_joint_foot_points`."""
+    """Return the fields of `Curves.refine`."""
     search = _Search.of(spans, control_points, points, curve, u_low, u_high)
     start = search.stretch.moved_into(u_start + spans.shift.take(curve))
     return search.finish(control_points, search.newton(start, iterations, _SAFEGUARDED))

@@ -60,8 +60,14 @@ def moved_residual(layout: Layout, rows: Rows, change: Array) -> Array:
     return np.asarray(rows.residual - (rows.jacobian * change[_known_columns(layout, rows)]).sum(axis=1))
 
 
-def block_of(layout: Layout, groups: Sequence[Rows]) -> tuple[IntArray, Array]:
-    """Return the places (h,) of the variables that rows hold, and `[J -r]` (m, n + 1) on them, by columns."""
+def blocks_of(layout: Layout, groups: Sequence[Rows]) -> list[tuple[int, IntArray, Array]]:
+    """Return each owner, ascending, with places (h,) of its rows' variables and `[J -r]` (m, n + 1)."""
+    owners = np.unique(np.concatenate([NO_KEYS, *(rows.owner for rows in groups)])).tolist()
+    own = {owner: [rows.where(rows.owner == owner) for rows in groups if len(rows)] for owner in owners}
+    return [(owner, *_block(layout, [rows for rows in own[owner] if len(rows)])) for owner in owners]
+
+
+def _block(layout: Layout, groups: Sequence[Rows]) -> tuple[IntArray, Array]:
     sought = np.concatenate([NO_KEYS, *(rows.keys.ravel() for rows in groups)])
     held = np.flatnonzero(among(layout.keys, np.sort(sought)))
     part, end = Layout(layout.keys[held]), 0
@@ -117,7 +123,7 @@ class RowStore:
     def pop(self, owner: int, layout: Layout) -> tuple[IntArray, Array]:
         leaving = [rows.where(rows.owner == owner) for rows in self.groups]
         self.drop(np.array([owner]))
-        return block_of(layout, [rows for rows in leaving if len(rows)])
+        return _block(layout, [rows for rows in leaving if len(rows)])
 
 
 def summed(

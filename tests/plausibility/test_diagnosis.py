@@ -117,7 +117,7 @@ def test_a_run_says_what_sets_the_size_of_its_map() -> None:
     run = RunNoise("measured", "measured", MEASURED, "odometry")
     assert noise_lines(run)[1] == (
         "ranges and speeds disagree by 10 %: the map's size is the odometry's (--calibration.trust ranges "
-        "turns it round)"
+        "reverses that)"
     )
     assert "the ranges' (--calibration.trust odometry" in noise_lines(replace(run, size="ranges"))[1]
     assert len(noise_lines(replace(run, size=None))) == 1

@@ -438,7 +438,7 @@ def test_advice_on_the_mounting_is_in_metres_of_the_log(scale: float, ahead: str
     assert found.advice.startswith(ahead)
     words = found.advice.split()
     assert [float(words[1]), float(words[5])] == pytest.approx([2.5 * scale, -scale], abs=0.4 * scale)
-    along, aside = re.search(r"sensor (\S+) m ahead and (\S+) m to the right", found.found).groups()
+    along, aside = re.search(r"sensor were (\S+) m ahead and (\S+) m to the right", found.found).groups()
     assert [float(along), float(aside)] == pytest.approx([2.5 * scale, scale], abs=0.4 * scale)
 
 
@@ -446,7 +446,7 @@ def test_a_hint_on_the_stated_noise_has_the_numbers_of_the_log() -> None:
     log = scaled(short_drive(), 0.1)
     stated = 0.4 * log.odometry_sigma
     (found,) = hints(replace(log, odometry_sigma=stated))
-    said = re.findall(r"(v\w|wz) scatters by (\S+) (\S+), where (\S+) is stated", found.found)
+    said = re.findall(r"(v\w|wz) scatters by (\S+) (\S+), and (\S+) is stated", found.found)
     assert [(name, unit) for name, _, unit, _ in said] == [("vx", "m/s"), ("vy", "m/s"), ("wz", "rad/s")]
     assert [float(number) for *_, number in said] == pytest.approx(stated, rel=0.06)
     assert [float(number) for _, number, *_ in said] == pytest.approx(log.odometry_sigma, rel=0.5)

@@ -58,7 +58,7 @@ def test_a_boundary_that_sweeps_across_the_road_is_found_with_its_place(scale: f
     assert one.label == LEFT
     np.testing.assert_allclose(one.place, [28.8 * scale, 0.0], atol=0.5 * scale)
     assert one.driven == pytest.approx(28.8 * scale, abs=0.7 * scale)
-    said = f"the left boundary lies across the way driven at x = {one.place[0]:.3g} m"
+    said = f"the left boundary lies across the driven path at x = {one.place[0]:.3g} m"
     assert crossings_told([one]).startswith(said)
 
 

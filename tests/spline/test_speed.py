@@ -124,7 +124,7 @@ def test_each_step_obeys_the_friction_ellipse_at_its_slower_end(curvature: Array
 def test_bad_lines_and_speeds_are_refused() -> None:
     with pytest.raises(SettingsError, match="at least 2 points, found 1"):
         speed_profile(open_line(np.zeros(1), 1.0))
-    with pytest.raises(SettingsError, match="from 0 on, found -1"):
+    with pytest.raises(SettingsError, match="at least 0, found -1"):
         speed_profile(open_line(np.zeros(5), 1.0), begin=-1.0)
     with pytest.raises(SettingsError, match="lateral: expected a positive"):
         SpeedSettings(lateral=0.0)
