@@ -30,7 +30,7 @@ def table(rows: Rows) -> str:
     columns = [*dict.fromkeys(row["column"] for row in rows)]
     lines = [[title, *columns], [":---", *["---:"] * len(columns)]]
     for label in dict.fromkeys(row[title] for row in rows):
-        cells = {row["column"]: figure(row) for row in rows if row[title] == label}
+        cells = {row["column"]: figure(row).replace(" ", "&nbsp;") for row in rows if row[title] == label}
         lines.append([label, *(cells[column] for column in columns)])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 

@@ -349,7 +349,7 @@ def test_a_line_that_links_figures_becomes_their_table(
         "",
         "| of | x | y |",
         "| :--- | ---: | ---: |",
-        "| a | 1.0 ± 0.1 |  |",
+        "| a | 1.0&nbsp;±&nbsp;0.1 |  |",
         "| b | 2.0 | 3 |",
         "",
         "*[One](figures/one.csv)*",
