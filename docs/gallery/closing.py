@@ -28,4 +28,3 @@ cycles = result.to_frame()
 figure, axes = plt.subplots(figsize=(7, 2.5), layout="constrained")
 axes.plot(cycles["t"], cycles["size_left"] + cycles["size_right"])
 axes.set(xlabel="t [s]", ylabel="control points")
-figure

@@ -38,4 +38,3 @@ u = np.linspace(*left.spline.domain, 400)
 figure, axes = plt.subplots(figsize=(7, 2.5), layout="constrained")
 axes.plot(u, left.spline.normal_sigma(u, left.covariance))
 axes.set(xlabel="parameter of the left boundary [m]", ylabel="sigma across [m]")
-figure

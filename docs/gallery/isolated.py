@@ -70,7 +70,6 @@ below.plot(u[::6], sampled[::6], "k.", label="2000 sampled splines")
 below.set(xlabel="parameter [m]", ylabel="sigma across the curve [m]")
 above.legend()
 below.legend()
-figure
 
 
 # %% [markdown]
@@ -118,7 +117,6 @@ for axes, (curve, sigma), name in zip(panels, steps, ("before", "extended", "upd
     axes.plot(*others.T, "o", color="C2", markersize=4)
     axes.plot(*detections[beyond].T, "o", color="C3", markersize=4)
     axes.legend()
-figure
 
 # %% [markdown]
 # ## The fit of detections
@@ -141,7 +139,6 @@ draw(axes, curve, "C0", "curve of the state")
 draw(axes, fitted, "C4", "curve fitted to the detections", measurement.covariance)
 axes.plot(*readings.T, "o", color="C2", label="detections")
 axes.legend()
-figure
 
 # %% [markdown]
 # ## Simplification
@@ -170,4 +167,3 @@ for error, name in zip(errors, ("by curvature", "uniform"), strict=True):
 below.set(xlabel="along the curve", ylabel="distance from the old one [cm]")
 above.legend()
 below.legend()
-figure

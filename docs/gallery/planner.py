@@ -28,4 +28,3 @@ how.plot(line.arc_length, line.width_left, label="left")
 how.plot(line.arc_length, line.width_right, label="right")
 how.set(xlabel="arc length [m]", ylabel="width [m]")
 how.legend()
-figure
