@@ -54,6 +54,8 @@ def package_of(folder: Path) -> str:
 
 def test_the_package_holds_links_to_the_folders_beside_it() -> None:
     """So setuptools, mypy and editors find one ordinary package."""
+    if not (ROOT / LINKS[0]).exists():
+        pytest.skip("an sdist has folders in place of links")
     for name in LINKS:
         link = ROOT / "pathspace_graph" / name
         assert link.is_symlink() and link.resolve() == ROOT / name
