@@ -116,6 +116,14 @@ def test_a_package_that_is_not_built_says_what_to_do() -> None:
     assert done.stderr.splitlines()[-1] == f"ImportError: {kernels} is missing: run pip install -e ."
 
 
+def test_a_command_without_its_extra_says_how_to_install_it() -> None:
+    run = "from pathspace_graph.cli import main; sys.exit(main(['compare', 'log', '--out', 'out']))"
+    code = f"import sys; sys.modules['pandas'] = None; {run}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    said = "pathspace-graph: expected the package pandas (pip install -e '.[eval]'), found none\n"
+    assert (done.returncode, done.stderr) == (2, said)
+
+
 def test_the_package_itself_imports_nothing_but_the_standard_library() -> None:
     loaded = modules_after("import pathspace_graph")
     assert not loaded & {"numpy", "scipy", "gtsam", "matplotlib", "pandas"}
