@@ -1,6 +1,6 @@
-"""`python -m pathspace_graph.eval.hints` measures of how many spoiled logs the cause is named.
+"""The study of hints: of how many spoiled logs is the cause named, and which good logs are accused?
 
-Good logs of all kinds are judged: what is unusual about them is no mistake, and none may be accused.
+Good logs of all kinds are judged: what is unusual about them is no mistake.
 """
 
 import time
@@ -8,32 +8,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Final, Never
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-import tyro
-from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
-from tyro.conf import arg
 
-from pathspace_graph.console import note, progress, say
-from pathspace_graph.errors import PathspaceError, SolveError, check_name
-from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
+from pathspace_graph.errors import check_name
 from pathspace_graph.eval.experiment.drives import load_tracks
-from pathspace_graph.eval.experiment.frame import write_csv
-from pathspace_graph.eval.experiment.run import OnCell, WorkerDiedError, run_cells
-from pathspace_graph.eval.experiment.tables import TextTable
-from pathspace_graph.eval.metrics.accuracy import lap_metrics
-from pathspace_graph.io.files import atomic_folder, check_target, write_text
-from pathspace_graph.io.log import Detections, Log, Odometry, write_log
+from pathspace_graph.eval.experiment.rows import rows_of
+from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.overrides import Overrides, override
 from pathspace_graph.labels import LEFT
-from pathspace_graph.plausibility.judge import hints, read_plausible_log
-from pathspace_graph.run import run_online
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.sim.mistakes import MISTAKES
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -41,9 +28,7 @@ from pathspace_graph.sim.track import Track
 
 Row = dict[str, Any]
 
-MARKER: Final = "hints.csv"  # file of the results, by which their folder is recognized
 AS_SIMULATED: Final = "as simulated"  # kind of good logs with nothing unusual
-CONFIDENCE: Final = 0.95
 _SELF_NAMED: Final = (
     "positions",
     "speeds",
@@ -180,69 +165,39 @@ GOOD: Final = {
 class HintStudy:
     """Spoil simulated logs by each mistake, and vary good ones; say how many are named and accused."""
 
-    out: Path
-    """Folder for the results; earlier ones there are kept as a numbered backup."""
-    tracks: Annotated[tuple[str, ...], arg(metavar="TRACK...")] = ("0", "1")
+    tracks: tuple[Path | int, ...] = (0, 1)
     """Track files, folders of them, or seeds of generated tracks."""
     seeds: tuple[int, ...] = (0, 1)
     """Seeds of the drives on each track."""
     laps: int = 1
     """Laps of each drive."""
-    good: bool = True
-    """Judge good logs of all kinds as well."""
     mistakes: tuple[str, ...] = tuple(MISTAKES)
     """Mistakes by which logs are spoiled."""
     kinds: tuple[str, ...] = (AS_SIMULATED,)
     """Kinds of good logs that are spoiled."""
-    maps: bool = False
-    """Measure what becomes of the map of each spoiled log, too, which takes long."""
-    jobs: int = 1
-    """Number of processes at a time, -1 for one on each core."""
 
-    def measure(self, on_cell: OnCell | None = None) -> pd.DataFrame:
-        """Judge every log, and return a row for each."""
+    def measure(self, **how: Any) -> pd.DataFrame:
+        """Judge every log, and return a row for each; `how` is that of `rows_of`."""
         for name in self.mistakes:
-            check_name(name, MISTAKES, "--mistakes: expected a known mistake")
+            check_name(name, MISTAKES, "mistakes: expected a known one")
         for name in self.kinds:
-            check_name(name, GOOD, "--kinds: expected a known kind of good log")
-        kinds = tuple(kind for kind in GOOD if self.good or kind in self.kinds)
-        tracks = load_tracks([int(one) if one.isdigit() else Path(one) for one in self.tracks])
-        cells = [*product([self], tracks, self.seeds, kinds)]
-        rows = run_cells(cells, judge, lost, jobs=self.jobs, on_cell=on_cell)
-        return pd.DataFrame([row for of in rows for row in of])
-
-    def run(self) -> TextTable:
-        check_target(self.out, MARKER)
-        with progress("judging") as advance:
-            frame = self.measure(advance)
-        table = summary(frame)
-        with atomic_folder(self.out, MARKER) as folder:
-            write_csv(folder / MARKER, frame)
-            write_text(folder / "hints.md", table.markdown())
-        return table
+            check_name(name, GOOD, "kinds: expected a known kind of good log")
+        parts = [
+            {"track": track, "seed": seed, "kind": kind, "laps": self.laps}
+            | {"mistakes": self.mistakes if kind in self.kinds else ()}
+            for track, seed, kind in product(load_tracks(self.tracks), self.seeds, GOOD)
+        ]
+        return rows_of(judge, parts, **how)
 
 
-HintCell = tuple[HintStudy, Track, int, str]  # study, track, seed and kind of good log
-
-
-def judge(cell: HintCell) -> list[Row]:
-    """Return a row for the good log of a cell, and for each of those that are spoiled."""
-    study, track, seed, kind = cell
-    spoil = kind in study.kinds
-    log = GOOD[kind].log(track, seed, study.laps)
-    good: Row = {"kind": "good", "name": kind, "of": kind}
-    rows = [good | judged(log)] if study.good else []
-    clean = mapped(log) if study.maps and spoil else {}
-    for name in study.mistakes if spoil else ():
+def judge(track: Track, seed: int, kind: str, laps: int, mistakes: Sequence[str]) -> list[Row]:
+    """Return a row for the good log of a kind, and for each of those that are spoiled by mistakes."""
+    log = GOOD[kind].log(track, seed, laps)
+    rows: list[Row] = [{"of": kind, "kind": "good", "name": kind, **judged(log)}]
+    for name in mistakes:
         spoiled = MISTAKES[name](log)
-        row = {"of": kind, "kind": "spoiled", "name": name, **judged(spoiled, causes_of(name))}
-        rows.append(row | (outcome(mapped(spoiled), clean) if study.maps else {}))
+        rows.append({"of": kind, "kind": "spoiled", "name": name, **judged(spoiled, causes_of(name))})
     return [{"track": track.name, "seed": seed} | row for row in rows]
-
-
-def lost(cell: HintCell, error: WorkerDiedError) -> Never:
-    _, track, _, kind = cell
-    raise SolveError(f"{kind} on {track.name}: {error}")
 
 
 def causes_of(mistake: str) -> tuple[str, ...]:
@@ -263,77 +218,3 @@ def judged(log: Log, causes: Sequence[str] = ()) -> Row:
         "seconds": seconds,
         "text": " | ".join(hint.line for hint in said),
     }
-
-
-def mapped(log: Log) -> Row:
-    """Return what the default estimator makes of a log in files: a refusal, or the errors of its map."""
-    with TemporaryDirectory() as folder, threadpool_limits(limits=1):
-        write_log(log, Path(folder) / "log")
-        try:
-            usable, _ = read_plausible_log(Path(folder) / "log", LimitSettings())
-            result = run_online(usable, make_online(DEFAULT_ONLINE, MapperSettings(), usable))
-        except PathspaceError as error:
-            return {"refusal": str(error).replace(str(folder), "")}
-    if log.truth is None or not result.map.boundaries:
-        return {"boundaries": len(result.map.boundaries)}
-    errors = lap_metrics(result.map, log.truth, result.laps)
-    return {"boundaries": len(result.map.boundaries), "rmse": errors.rmse, "missed": errors.missed}
-
-
-def outcome(found: Row, clean: Row) -> Row:
-    """Return what became of the map: it is refused, empty, bad or good.
-
-    It is bad where it misses 5 % more of the cones than that of the good log, or has twice its rmse.
-    """
-    if "refusal" in found:
-        return {**found, "map": "refused"}
-    if found["boundaries"] == 0:
-        return {**found, "map": "empty"}
-    worse = found["missed"] > 0.05 + clean["missed"] or not found["rmse"] <= 2.0 * clean["rmse"]
-    return {**found, "map": "bad" if worse or found["boundaries"] < clean["boundaries"] else "good"}
-
-
-def summary(rows: pd.DataFrame) -> TextTable:
-    """Return the table: for each kind of log how many were named or accused, with exact intervals."""
-    lines, groups = list[tuple[str, ...]](), list[int]()
-    for kind, column in (("spoiled", "named"), ("good", "accused")):
-        of_kind = rows[rows["kind"] == kind]
-        groups += [len(lines)] if len(of_kind) else []
-        by_name = (*of_kind.groupby("name", sort=False), ("all", of_kind)) if len(of_kind) else ()
-        lines += [_line(f"{column}: {name}", logs, column) for name, logs in by_name]
-    title = (
-        "Spoiled logs whose cause is named, and good logs that are accused of anything, with the "
-        f"{100.0 * CONFIDENCE:.0f} % interval of Clopper and Pearson."
-    )
-    header = ("logs", "number", "of", "share [%]", "interval [%]", "maps", "seconds")
-    return TextTable(title, header, tuple(lines), groups=tuple(groups[1:]))
-
-
-def _line(name: str, logs: pd.DataFrame, column: str) -> tuple[str, ...]:
-    count, total = int(logs[column].sum()), len(logs)
-    interval = binomtest(count, total).proportion_ci(CONFIDENCE)
-    maps = logs["map"].value_counts().to_dict() if "map" in logs and column == "named" else {}
-    return (
-        name,
-        str(count),
-        str(total),
-        f"{100.0 * count / total:.1f}",
-        f"{100.0 * interval.low:.1f} to {100.0 * interval.high:.1f}",
-        ", ".join(f"{number} {what}" for what, number in maps.items()),
-        f"{np.median(logs['seconds']):.2f}",
-    )
-
-
-def main() -> None:
-    """Run the script; the exit code is 2 on bad input."""
-    study = tyro.cli(HintStudy)
-    try:
-        table = study.run()
-    except PathspaceError as error:
-        note(f"hints: {error}")
-        raise SystemExit(2) from error
-    say(table.title, table.text(), f"written to {study.out}")
-
-
-if __name__ == "__main__":
-    main()

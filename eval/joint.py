@@ -16,8 +16,8 @@ from pathspace_graph.io.moved import moved_run
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from .cars import CARS, generated, on_tracks
-from .experiment.run import OnCell
+from .cars import CARS, generated
+from .experiment.rows import rows_of
 from .metrics.alignment import shape_rmse
 from .metrics.consistency import consistency_at_cones, map_nees
 from .metrics.trajectory import position_rms, trajectory_errors
@@ -39,25 +39,28 @@ class JointStudy:
     tracks: tuple[int, ...] = (50, 51, 52)  # seeds
     drives: int = 8  # number of drives of each track, a power of two
     cars: Mapping[str, SimulationSettings] = field(default_factory=lambda: CARS)
-    jobs: int = 1
 
-    def measure(self, on_cell: OnCell | None = None) -> pd.DataFrame:
-        """Return a row for each map: car, track, number of drives, and the metrics of `COLUMNS`."""
-        return on_tracks(self._of_track, [*self.cars], self.tracks, self.jobs, on_cell)
+    def measure(self, **how: Any) -> pd.DataFrame:
+        """Return a row for each map: car, track, drives in it, `COLUMNS`; `how` is that of `rows_of`."""
+        parts = [
+            {"car": car, "track": track, "settings": settings, "drives": self.drives}
+            for track in self.tracks
+            for car, settings in self.cars.items()
+        ]
+        return rows_of(of_track, parts, **how)
 
-    def _of_track(self, car: str, number: int) -> list[dict[str, Any]]:
-        """Return the rows of one track, each drive of which is solved alone once."""
-        track, settings = generated(number), self.cars[car]
-        logs = {str(seed): simulate(track, settings, seed) for seed in range(self.drives)}
-        alone = {name: solve_alone(log) for name, log in logs.items()}
-        names, rows, count = [*logs], list[dict[str, Any]](), 1
-        while count <= self.drives:
-            for begin in range(0, self.drives, count):
-                group = {name: logs[name] for name in names[begin : begin + count]}
-                about = {"car": car, "track": number, "drives": count}
-                rows.append(about | metrics_of_group(group, alone))
-            count *= 2
-        return rows
+
+def of_track(car: str, track: int, settings: SimulationSettings, drives: int) -> list[dict[str, Any]]:
+    """Return the rows of one track, each drive of which is solved alone once."""
+    logs = {str(seed): simulate(generated(track), settings, seed) for seed in range(drives)}
+    alone = {name: solve_alone(log) for name, log in logs.items()}
+    names, rows, count = [*logs], list[dict[str, Any]](), 1
+    while count <= drives:
+        for begin in range(0, drives, count):
+            group = {name: logs[name] for name in names[begin : begin + count]}
+            rows.append({"car": car, "track": track, "drives": count} | metrics_of_group(group, alone))
+        count *= 2
+    return rows
 
 
 def solve_alone(log: Log) -> BatchResult:

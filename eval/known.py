@@ -1,6 +1,6 @@
 """How a vehicle finds itself on a known map: anywhere on it, on that of another track, on a changed one."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -19,8 +19,8 @@ from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from .cars import CARS, generated, on_tracks
-from .experiment.run import OnCell
+from .cars import CARS, generated
+from .experiment.rows import rows_of
 from .metrics.accuracy import lap_metrics
 from .metrics.trajectory import interpolate_poses
 from .views import Figure, View
@@ -48,32 +48,38 @@ class KnownStudy:
     tracks: tuple[int, ...] = (60, 61, 62, 63, 64, 65, 66, 67)  # seeds
     begins: tuple[float, ...] = (0.0, 0.3, 0.6)  # where drives begin, as shares of the first lap's time
     cars: Mapping[str, SimulationSettings] = field(default_factory=lambda: CARS)
-    jobs: int = 1
 
-    def measure(self, on_cell: OnCell | None = None) -> pd.DataFrame:
-        """Return a row for each drive: car, track, kind of map, begin, and the metrics of `COLUMNS`."""
-        return on_tracks(self._of_track, [*self.cars], self.tracks, self.jobs, on_cell)
+    def measure(self, **how: Any) -> pd.DataFrame:
+        """Return a row for each drive: car, track, kind, begin, `COLUMNS`; `how` is that of `rows_of`."""
+        parts = [
+            {"car": car, "track": track, "settings": settings, "begins": self.begins}
+            for track in self.tracks
+            for car, settings in self.cars.items()
+        ]
+        return rows_of(of_track, parts, **how)
 
-    def _of_track(self, car: str, number: int) -> list[dict[str, Any]]:
-        """Return the rows of the second drive of a track, on maps of the first one and of another track."""
-        settings, rows = self.cars[car], list[dict[str, Any]]()
-        first, second = (simulate(generated(number), settings, seed) for seed in (0, 1))
-        elsewhere = simulate(generated(number + 1000), settings, 0)
-        truth = truth_of(first)
-        motion = motion_onto(truth_of(second).cones, truth.cones)
-        rng = np.random.default_rng(number)
-        maps = {
-            OWN: mapped(first),
-            SURVEYED: surveyed(truth, rng),
-            MOVED: surveyed(truth, rng, MOVED_CONES),
-            OTHER: mapped(elsewhere),
-        }
-        for kind, known in maps.items():
-            rmse = np.nan if kind == OTHER else lap_metrics(known, truth, 0).rmse
-            for share in self.begins:
-                about = {"car": car, "track": number, "kind": kind, "begin": share, "map": rmse}
-                rows.append(about | drive_on(known, second, share, motion))
-        return rows
+
+def of_track(
+    car: str, track: int, settings: SimulationSettings, begins: Sequence[float]
+) -> list[dict[str, Any]]:
+    """Return the rows of the second drive of a track, on maps of the first one and of another track."""
+    first, second = (simulate(generated(track), settings, seed) for seed in (0, 1))
+    elsewhere = simulate(generated(track + 1000), settings, 0)
+    truth, rows = truth_of(first), list[dict[str, Any]]()
+    motion = motion_onto(truth_of(second).cones, truth.cones)
+    rng = np.random.default_rng(track)
+    maps = {
+        OWN: mapped(first),
+        SURVEYED: surveyed(truth, rng),
+        MOVED: surveyed(truth, rng, MOVED_CONES),
+        OTHER: mapped(elsewhere),
+    }
+    for kind, known in maps.items():
+        rmse = np.nan if kind == OTHER else lap_metrics(known, truth, 0).rmse
+        for share in begins:
+            about = {"car": car, "track": track, "kind": kind, "begin": share, "map": rmse}
+            rows.append(about | drive_on(known, second, share, motion))
+    return rows
 
 
 def truth_of(log: Log) -> Truth:

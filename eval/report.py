@@ -13,7 +13,6 @@ from typing import Any, Final
 import pandas as pd
 
 from pathspace_graph.errors import SettingsError, check_name
-from pathspace_graph.estimators import DEFAULT_ONLINE
 from pathspace_graph.sim.mistakes import MISTAKES
 
 from . import real, views
@@ -141,17 +140,16 @@ class Plan:
 
     def hints(self, folder: Path) -> Views:
         small: dict[str, Any] = {"mistakes": tuple(MISTAKES)[:2]} if self.quick else {}
-        tracks = tuple(map(str, GENERATED[: 1 if self.quick else 3]))
-        study = HintStudy(out=folder, tracks=tracks, seeds=(0,), jobs=self.jobs, **small)
-        return {"": views.hints_table(study.measure(self.on_cell))}
+        study = HintStudy(tracks=GENERATED[: 1 if self.quick else 3], seeds=(0,), **small)
+        return {"": views.hints_table(study.measure(folder=folder, **self._how))}
 
-    def joint(self, _: Path) -> Views:
+    def joint(self, folder: Path) -> Views:
         small: dict[str, Any] = {"tracks": (50,), "drives": 2} if self.quick else {}
-        return {"": joint_table(JointStudy(jobs=self.jobs, **small).measure(self.on_cell))}
+        return {"": joint_table(JointStudy(**small).measure(folder=folder, **self._how))}
 
-    def known(self, _: Path) -> Views:
+    def known(self, folder: Path) -> Views:
         small: dict[str, Any] = {"tracks": (60,), "begins": (0.3,)} if self.quick else {}
-        return {"": known_table(KnownStudy(jobs=self.jobs, **small).measure(self.on_cell))}
+        return {"": known_table(KnownStudy(**small).measure(folder=folder, **self._how))}
 
     def speed(self, _: Path) -> Views:
         """Time every estimator in turn on the same cycles."""
@@ -172,12 +170,12 @@ class Plan:
             "measured": real.measured_table(drives),
         }
 
-    def scale(self, _: Path) -> Views:
+    def scale(self, folder: Path) -> Views:
         settings = QUICK if self.quick else ScalingSettings(cones_max=800.0, laps=10)
-        header, found = scaling_figures(measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings))
-        return {
-            "": (header, tuple((name, Figure.row((v for v, _ in row), 2)) for name, row in found.items()))
-        }
+        scaling = measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings, folder=folder)
+        header, found = scaling_figures(scaling)
+        rows = ((name, Figure.row((value for value, _ in row), 2)) for name, row in found.items())
+        return {"": (header, tuple(rows))}
 
     def _shipped(self, name: str, folder: Path, **small: Any) -> tuple[Study, pd.DataFrame]:
         """Drive a shipped study, made smaller: with `quick` the first variant for one lap."""
@@ -189,7 +187,11 @@ class Plan:
         return study, self._run(study, folder)
 
     def _run(self, study: Study, folder: Path) -> pd.DataFrame:
-        return run_study(study, folder, jobs=self.jobs, on_cell=self.on_cell)
+        return run_study(study, folder, **self._how)
+
+    @property
+    def _how(self) -> dict[str, Any]:
+        return {"jobs": self.jobs, "on_cell": self.on_cell}
 
 
 EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
@@ -241,7 +243,7 @@ def tidy(view: View, about: Mapping[str, str]) -> pd.DataFrame:
 
 def provenance(plan: Plan, name: str) -> dict[str, str]:
     """Return commit, machine and date of this run, and the command that measures an experiment again."""
-    run = made(DEFAULT_ONLINE)
+    run = made(__name__)
     given = {"accuracy": " --tracks TRACKS" * bool(plan.tracks), "real": " --real LOGS"}.get(name, "")
     command = f"pathspace-graph report --only {name}{given}{' --quick' * plan.quick}"
     return {

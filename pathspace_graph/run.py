@@ -145,6 +145,7 @@ class ObservedCycle:
             offered=len(self.detections.labels),
             health=result.health.condition,
             reason=result.health.reason,
+            processor=self.processor,
             **{name: getattr(result, name) for name in same},
         )
 

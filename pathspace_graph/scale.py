@@ -6,6 +6,7 @@ the gaps of its rows in the first metres of the log.
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Final, TypeVar
 
 import numpy as np
@@ -71,6 +72,7 @@ class SceneScale:
         return len(self._gaps) >= SCENE_ENOUGH or self._cycles >= SCENE_PATIENCE
 
 
+@lru_cache(maxsize=1)  # several ask about the log that was read last
 def scale_of(log: Log) -> float:
     """Return the scale of a log's scene, by the first metres of its drive."""
     scene = SceneScale()

@@ -4,15 +4,16 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import scipy  # which imports its modules when they are used
+from msgspec import Meta, Struct, field
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.io import parsing as limits
-from pathspace_graph.io.parsing import Table, parse_yaml, read_table, read_text, shown
+from pathspace_graph.io.parsing import Table, parse_yaml, read_table, read_text, typed
 from pathspace_graph.labels import BIG_ORANGE, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
@@ -104,30 +105,54 @@ def _is_fssim(data: Any) -> bool:
     return isinstance(data, dict) and not {"cones_left", "cones_right"}.isdisjoint(data)
 
 
+Number = Annotated[float, Meta(ge=-limits.MAX_COORDINATE, le=limits.MAX_COORDINATE)]
+Point = Annotated[list[Number], Meta(min_length=2)]
+Angles = Annotated[list[Number], Meta(min_length=3)]  # also a place with a heading
+
+
+class _Cone(Struct):
+    position: Point
+    kind: Any = field(name="class", default="")
+
+
+Cones = Annotated[list[_Cone], Meta(max_length=limits.MAX_CONES)] | None
+Points = Annotated[list[Point], Meta(max_length=limits.MAX_CONES)] | None
+
+
+class _Start(Struct):
+    position: Point
+    orientation: Angles
+
+
+class _Pacsim(Struct):
+    closed: bool = field(name="lanesFirstWithLastConnected")
+    start: _Start
+    left: Cones
+    right: Cones
+    unknown: Cones = None
+
+
+class _Fssim(Struct):
+    cones_left: Points
+    cones_right: Points
+    starting_pose_front_wing: Angles
+    cones_orange: Points = None
+    cones_orange_big: Points = None
+
+
 def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
-    data = content["track"]
-    closed = _get(path, data, "lanesFirstWithLastConnected", "track.")
-    if not isinstance(closed, bool):
-        expected = "expected true or false at track.lanesFirstWithLastConnected"
-        raise InputError(path, f"{expected}, found {shown(closed)}")
-    start = _get(path, data, "start", "track.")
-    position, orientation = (
-        _vector(path, _get(path, start, name, "track.start."), size, f"track.start.{name}")
-        for name, size in (("position", 2), ("orientation", 3))
-    )
-    rows = [
-        _pacsim_cones(path, _get(path, data, name, "track."), f"track.{name}") for name in ("left", "right")
-    ]
-    others = [_pacsim_cones(path, data.get("unknown"), "track.unknown"), *rows]
+    data = typed(content["track"], _Pacsim, path, "track", strict=False)
+    rows = [_pacsim_cones(cones) for cones in (data.left, data.right)]
+    others = [_pacsim_cones(data.unknown), *rows]
     other, kinds = (np.concatenate(parts) for parts in zip(*others, strict=True))
     big, orange = (np.char.find(kinds, word) >= 0 for word in ("big", ORANGE))
     labels = np.where(orange, np.where(big, BIG_ORANGE, SMALL_ORANGE), UNKNOWN)
     no_boundary = orange | (np.arange(len(labels)) < len(others[0][0]))
     left, right = (
-        _without_repeats(points[np.char.find(kinds, ORANGE) < 0], closed) for points, kinds in rows
+        _without_repeats(points[np.char.find(kinds, ORANGE) < 0], data.closed) for points, kinds in rows
     )
-    start = np.append(position, orientation[2])
-    track = Track(left, right, other[no_boundary], closed, start, path.stem, labels[no_boundary])
+    start = np.array([*data.start.position[:2], data.start.orientation[2]])
+    track = Track(left, right, other[no_boundary], data.closed, start, path.stem, labels[no_boundary])
     hidden = np.vstack([points[kinds == INVISIBLE] for points, kinds in rows])
     return _with_hidden(track, hidden) if len(hidden) else track
 
@@ -140,62 +165,23 @@ def _with_hidden(track: Track, hidden: FloatArray) -> Track:
     return replace(track, left=left, right=right, path=track.centre_line.points(s))
 
 
-def _pacsim_cones(path: Path, cones: object, key: str) -> tuple[FloatArray, NDArray[np.str_]]:
+def _pacsim_cones(cones: Cones) -> tuple[FloatArray, NDArray[np.str_]]:
     """Return the points (n, 2) and the classes (n,) of a list of cones."""
-    points, kinds = [], []
-    for k, cone in enumerate(_list(path, cones, key)):
-        points.append(_vector(path, _get(path, cone, "position", f"{key}[{k}]."), 2, f"{key}[{k}].position"))
-        kinds.append(str(cone.get("class", "")))
-    return np.array(points).reshape(-1, 2), np.array(kinds, str)
+    points = _points([cone.position for cone in cones or ()])
+    return points, np.array([str(cone.kind) for cone in cones or ()], str)
 
 
-def _fssim(path: Path, data: Mapping[str, Any]) -> Track:
-    left, right = (
-        _without_repeats(_fssim_cones(path, _get(path, data, name), name), closed=True)
-        for name in ("cones_left", "cones_right")
-    )
-    small, big = (_fssim_cones(path, data.get(name), name) for name in ("cones_orange", "cones_orange_big"))
-    start = _vector(path, _get(path, data, "starting_pose_front_wing"), 3, "starting_pose_front_wing")
+def _fssim(path: Path, content: Mapping[str, Any]) -> Track:
+    data = typed(content, _Fssim, path, strict=False)
+    left, right = (_without_repeats(_points(row), closed=True) for row in (data.cones_left, data.cones_right))
+    small, big = _points(data.cones_orange), _points(data.cones_orange_big)
+    start = np.array(data.starting_pose_front_wing[:3])
     kinds = np.repeat([SMALL_ORANGE, BIG_ORANGE], [len(small), len(big)])
     return Track(left, right, np.concatenate([small, big]), True, start, path.stem, kinds)
 
 
-def _fssim_cones(path: Path, cones: object, key: str) -> FloatArray:
-    points = [_vector(path, cone, 2, f"{key}[{k}]") for k, cone in enumerate(_list(path, cones, key))]
-    return np.array(points).reshape(-1, 2)
-
-
-def _get(path: Path, data: object, name: str, prefix: str = "") -> Any:
-    if not isinstance(data, dict) or name not in data:
-        raise InputError(path, f"expected a key {prefix}{name}, found none")
-    return data[name]
-
-
-def _list(path: Path, value: object, key: str) -> list[Any]:
-    if value is None:
-        return []
-    if not isinstance(value, list):
-        raise InputError(path, f"expected a list at {key}, found {shown(value)}")
-    if len(value) > limits.MAX_CONES:
-        raise InputError(path, f"expected at most {limits.MAX_CONES} cones at {key}, found {len(value)}")
-    return value
-
-
-def _vector(path: Path, value: object, size: int, key: str) -> FloatArray:
-    """Return the first `size` numbers of a list, all within the limit of coordinates."""
-    try:
-        # YAML 1.1 takes 1e-5 for a word, so words are given a chance to be numbers
-        vector = np.array([float(number) for number in value[:size]] if isinstance(value, list) else [])
-    except (TypeError, ValueError):
-        vector = np.zeros(0)
-    if len(vector) < size:
-        raise InputError(path, f"expected {size} numbers at {key}, found {shown(value)}")
-    if not np.isfinite(vector).all():
-        raise InputError(path, f"expected finite numbers at {key}, found {shown(value)}")
-    if np.abs(vector).max() > limits.MAX_COORDINATE:
-        expected = f"expected numbers of at most {limits.MAX_COORDINATE:g} in size at {key}"
-        raise InputError(path, f"{expected}, found {shown(value)}")
-    return vector
+def _points(rows: Points) -> FloatArray:
+    return np.array([row[:2] for row in rows or ()], float).reshape(-1, 2)
 
 
 def _without_repeats(row: FloatArray, closed: bool) -> FloatArray:

@@ -220,7 +220,7 @@ def test_the_graph_is_asked_as_the_page_on_python_does(log: Log) -> None:
     mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     for odometry, detections in split_odometry(log):
         mapper.update(odometry, detections)
-    _, block = blocks(ROOT / "docs" / "python.md", "python")
+    *_, block = blocks(ROOT / "docs" / "python.md", "python")
     make, show, *asks = ast.parse(block).body
     names: dict[str, Any] = {"mapper": mapper, "gtsam": gtsam}
     exec(compile(ast.Module([make, show], []), "python.md", "exec"), names)

@@ -86,10 +86,14 @@ class Drives:
     lap_ends: Array  # (m,) stamps at which its laps end (s)
 
     @property
+    def by_sweep(self) -> dict[str, list[Log]]:
+        """Return the logs of each sweep, which are driven in turn."""
+        return {"cones": [self.cones], "readings": [*self.readings.values()], "laps": [self.laps]}
+
+    @property
     def cycles(self) -> int:
         """Return the number of cycles of all three sweeps together."""
-        dense = max(len(log.cycles) for log in self.readings.values())
-        return len(self.cones.cycles) + dense + len(self.laps.cycles)
+        return sum(max(len(log.cycles) for log in logs) for logs in self.by_sweep.values())
 
 
 def make_drives(settings: ScalingSettings) -> Drives:

@@ -1,16 +1,12 @@
-"""Time of an update against the size of the map, its detections and the laps: points, power laws, figures.
-
-All estimators run in one process, every cycle in turn, so that what slows the machine down slows all alike.
-"""
+"""Time of an update against the size of the map, its detections and the laps: table and figures."""
 
 import math
 import platform
-import tracemalloc
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from itertools import cycle
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 try:
     import resource
@@ -22,98 +18,29 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter, ScalarFormatter
-from scipy.stats import linregress
-from threadpoolctl import threadpool_limits
 
-from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.experiment.frame import write_csv
+from pathspace_graph.eval.experiment.provenance import code_of
+from pathspace_graph.eval.experiment.rows import rows_of
+from pathspace_graph.eval.experiment.runner import OnCell
 from pathspace_graph.eval.experiment.tables import TextTable
 from pathspace_graph.eval.figures import style
 from pathspace_graph.eval.figures.style import MARKERS, PALETTE, WIDTH
 from pathspace_graph.eval.metrics.summary import versions
-from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.files import atomic_folder, write_json, write_text
-from pathspace_graph.io.log import Log
-from pathspace_graph.run import split_odometry, timed_update, timed_wait
+from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.settings.mapper import MapperSettings
 
+from .lanes import CONES, LAPS, POINT, READINGS, SLOPE, Sweep, memory_rows, sweep_rows
 from .roads import Drives, ScalingSettings, first_cycles
 
 MARKER: Final = "scaling.json"  # file by which a folder of results is known
 COMPARED_AT: Final = 200.0  # number of cones at which estimators are compared, that of an ordinary track
-Sweep = Literal["cones", "readings", "laps"]  # cones seen, detections of an update, or lap
-CONES: Final[Sweep] = "cones"
-READINGS: Final[Sweep] = "readings"
-LAPS: Final[Sweep] = "laps"
-Logs = Sequence[tuple[Log, int, Array]]  # log, number of detections if varied, abscissae (NaN doesn't count)
 _HEIGHT: Final = 3.1  # height of a figure (in)
 _TITLES: Final[dict[Sweep, tuple[str, str]]] = {  # axis title and title of each panel
     CONES: ("cones seen", "(a) map size"),
     READINGS: ("detections per update", "(b) detections"),
     LAPS: ("lap", "time per lap on a closed road"),
 }
-JUDGED: Final = 10  # number of updates whose mean is compared with the budget
-
-
-@dataclass(eq=False)
-class Lane:
-    """An estimator that is to map a log, and what was measured, until the log ended or it was stopped."""
-
-    estimator: str
-    log: Log
-    at: Array = field(default_factory=lambda: np.zeros(0))  # (n,) abscissa of each cycle; NaN doesn't count
-    readings: int = 0  # number of detections in each cycle of the log, where they are varied
-    seconds: list[float] = field(default_factory=list)  # processor time of each update (s)
-    sizes: list[int] = field(default_factory=list)  # size of the map after each update
-    stopped: str = ""  # why it did not reach the log's end; empty where it did
-
-    def updates(self, settings: MapperSettings, budget: float) -> Iterator[None]:
-        """Do an update at each step, until the log ends or the lane is stopped."""
-        estimator = make_online(self.estimator, settings, self.log)
-        for odometry, detections in split_odometry(self.log):
-            try:
-                timed_wait(estimator)
-                estimate, _, seconds = timed_update(estimator, odometry, detections)
-            except Exception as error:  # the table reports any failure
-                self.stopped = " ".join(f"{type(error).__name__}: {error}".split())
-                return
-            self.seconds.append(seconds)
-            self.sizes.append(sum(estimate.sizes))
-            if len(self.seconds) >= JUDGED and np.mean(self.seconds[-JUDGED:]) > budget:
-                self.stopped = f"over {budget:g} s an update"
-                return
-            yield
-
-
-def run_lanes(
-    lanes: Sequence[Lane],
-    settings: MapperSettings,
-    budget: float,
-    on_cycle: Callable[[], None] = lambda: None,
-) -> None:
-    """Give cycle k to every lane in turn; the lane that is first moves on by one with k.
-
-    So none always follows the same other. A lane stops if its last updates took over `budget` s on average.
-    """
-    runners = [lane.updates(settings, budget) for lane in lanes]
-    with threadpool_limits(limits=1):
-        for number in range(max(len(lane.log.cycles) for lane in lanes)):
-            first = number % len(runners)
-            for runner in (*runners[first:], *runners[:first]):
-                next(runner, None)
-            on_cycle()
-
-
-def peak_memory(lane: Lane, settings: MapperSettings) -> float:
-    """Return the peak (MB) of Python and numpy, not GTSAM, as the lane ran, by (slow) tracemalloc."""
-    tracemalloc.start()
-    try:
-        before, _ = tracemalloc.get_traced_memory()
-        tracemalloc.reset_peak()
-        run_lanes([lane], settings, float("inf"))
-        return (tracemalloc.get_traced_memory()[1] - before) / 1e6
-    finally:
-        tracemalloc.stop()
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,82 +72,42 @@ class Scaling:
         return float(np.exp(np.interp(np.log(cones), at, seconds, left=np.nan, right=np.nan)))
 
 
-def binned(sweep: Sweep, lane: Lane, edges: Array) -> pd.DataFrame:
-    """Return a point for each interval between two `edges` that holds cycles of a lane.
-
-    It has the means of `at`, of `seconds` of an update and of the map's `size`, and the number of `cycles`.
-    """
-    at = lane.at[: len(lane.seconds)]
-    frame = pd.DataFrame({"at": at, "seconds": lane.seconds, "size": lane.sizes})
-    bins = np.searchsorted(edges, frame["at"], side="right") - 1
-    inside = (bins >= 0) & (bins < len(edges) - 1)
-    points = frame[inside].groupby(bins[inside])
-    means = points.mean().assign(sweep=sweep, estimator=lane.estimator, cycles=points.size())
-    return means[["sweep", "estimator", "at", "seconds", "cycles", "size"]].reset_index(drop=True)
-
-
-def fit_slope(
-    sweep: Sweep, estimator: str, points: pd.DataFrame, fit_from: float = 0.0, stopped: str = ""
-) -> dict[str, Any]:
-    """Return the power law `seconds ~ at^slope`, a line fitted to the logarithms from `fit_from` on.
-
-    `error` is the standard error of the exponent; both are NaN with too few `points`, from `low` to `high`.
-    """
-    kept = points[points["at"] >= fit_from].astype({"at": float, "seconds": float})
-    slope = error = float("nan")
-    if len(kept) > 2:  # two would leave nothing to estimate the error from
-        line = linregress(np.log(kept["at"]), np.log(kept["seconds"]))
-        slope, error = float(line.slope), float(line.stderr)
-    fitted = {"slope": slope, "error": error, "points": len(kept)}
-    ends = {"low": float(kept["at"].min()), "high": float(kept["at"].max())}
-    return {"sweep": sweep, "estimator": estimator, **fitted, **ends, "stopped": stopped}
-
-
-def sweeps(drives: Drives, settings: ScalingSettings) -> dict[Sweep, tuple[Logs, Array, float]]:
-    """Return the logs of each sweep, the edges of its points' intervals, and where its slope begins."""
-    low, high = np.log(settings.cones_min), np.log(settings.cones_max + 1.0)
-    cones = np.exp(np.linspace(low, high, settings.bins + 1))
-    lap = 1.0 + np.searchsorted(drives.lap_ends, [seen.t for seen in drives.laps.cycles])
-    dense = []
-    for wanted, log in drives.readings.items():
-        counts = np.array([len(seen.labels) for seen in log.cycles])
-        counts[: settings.warm_up] = -1
-        dense.append((log, wanted, np.where(counts == wanted, float(wanted), np.nan)))
-    ends = np.arange(1.0, len(drives.lap_ends) + 2.0)
-    return {
-        CONES: ([(drives.cones, 0, drives.seen)], cones, settings.fit_from),
-        READINGS: (dense, np.append(np.sort(settings.readings), np.inf), 0.0),
-        LAPS: ([(drives.laps, 0, lap.astype(float))], ends, 2.0),
-    }
-
-
 def measure_scaling(
     estimators: Sequence[str],
     drives: Drives,
     settings: ScalingSettings,
     mapper: MapperSettings | None = None,
-    on_cycle: Callable[[], None] = lambda: None,
+    folder: Path | None = None,
+    on_cycle: OnCell = lambda *_: None,
 ) -> Scaling:
-    """Measure all three sweeps, and the memory; `on_cycle` is called after each cycle of a sweep."""
-    mapper = mapper or MapperSettings()
-    points, slopes = [], []
-    for sweep, (logs, edges, fit_from) in sweeps(drives, settings).items():
-        lanes = [Lane(name, log, at, k) for name in estimators for log, k, at in logs]
-        run_lanes(lanes, mapper, settings.budget, on_cycle)
-        for name in estimators:
-            own = [lane for lane in lanes if lane.estimator == name]
-            points.append(_joined([binned(sweep, lane, edges) for lane in own]))
-            stops = [(lane.readings, lane.stopped) for lane in own if lane.stopped]
-            stopped = "; ".join(f"{k} readings: {why}" if k else why for k, why in stops)
-            slopes.append(fit_slope(sweep, name, points[-1], fit_from, stopped))
+    """Measure all three sweeps, and the memory, each kept in a folder at once, or read from there.
+
+    `on_cycle` gets the numbers of cycles that are done, and of all that remained.
+    """
+    mapper, code = mapper or MapperSettings(), {name: code_of(name) for name in estimators}
+    shared, found = {"estimators": tuple(estimators), "settings": settings, "mapper": mapper}, []
+    done, total = 0, drives.cycles
+
+    def count() -> None:
+        nonlocal done
+        done += 1
+        on_cycle(done, total)
+
+    others = {"drives": drives, "on_cycle": count}
+    for sweep, logs in drives.by_sweep.items():
+        before = done
+        found.append(rows_of(sweep_rows, [{"sweep": sweep, **shared}], folder, others=others, depends=code))
+        total -= max(len(log.cycles) for log in logs) if done == before else 0  # it was kept
     end = int(np.searchsorted([seen.t for seen in drives.laps.cycles], drives.lap_ends[0]))
-    first_lap = first_cycles(drives.laps, end)
-    memory = {name: peak_memory(Lane(name, first_lap), mapper) for name in estimators}
-    return Scaling(settings, asdict(mapper), _joined(points), pd.DataFrame(slopes), memory)
-
-
-def _joined(points: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    return pd.concat([of for of in points if len(of)] or points[:1], ignore_index=True)
+    others, parts = (
+        {"first_lap": first_cycles(drives.laps, end)},
+        [{"estimator": name, "mapper": mapper} for name in estimators],
+    )
+    memory = rows_of(memory_rows, parts, folder, others=others, depends=[code, settings])
+    rows = pd.concat(found, ignore_index=True)
+    points, slopes = rows[rows["cycles"].notna()], rows[rows["cycles"].isna()]
+    peaks = dict(zip(estimators, memory["megabytes"].tolist(), strict=True))
+    return Scaling(settings, asdict(mapper), points[POINT].reset_index(drop=True), slopes[SLOPE], peaks)
 
 
 # --- table and files -------------------------------------------------------------------------------------
@@ -287,7 +174,7 @@ def write_scaling(out: Path, scaling: Scaling) -> None:
     }
     with atomic_folder(out, MARKER) as folder:
         write_csv(folder / "points.csv", scaling.points)
-        write_text(folder / "table.md", scaling_table(scaling).markdown())
+        scaling_table(scaling).write(folder, "table", "md")
         write_json(folder / MARKER, content)
         style.save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
 

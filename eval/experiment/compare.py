@@ -1,6 +1,7 @@
 """Every estimator on the same logs: the paper's Table 1, all metrics, paired differences, and all files."""
 
-from collections.abc import Sequence
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from itertools import zip_longest
@@ -14,21 +15,21 @@ from pathspace_graph import estimators as registry
 from pathspace_graph.errors import check_name
 from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.accuracy import GhostSettings, LapMetrics
-from pathspace_graph.eval.metrics.measures import online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
-from pathspace_graph.eval.metrics.summary import has_cones, summarize, versions
-from pathspace_graph.io.files import atomic_folder, write_json, write_text
-from pathspace_graph.io.results import BatchRun, write_result
-from pathspace_graph.plausibility.judge import read_plausible_log
+from pathspace_graph.eval.metrics.summary import has_cones, versions
+from pathspace_graph.io.files import atomic_folder, write_json
+from pathspace_graph.io.map import read_map
+from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import LimitSettings
 
-from .cells import Cell, Outcome, run_cell
-from .drives import NamedLog, log_folders
+from .cells import EstimatorCell
+from .drives import log_folders
 from .frame import add_batch, write_csv
-from .plots import blind_spot_figure, plot_maps
-from .run import OnCell, run_cells
+from .plots import Drawn, blind_spot_figure, plot_maps
+from .run import Plan, make_plan, run_records
+from .runner import Record, run_folder
 from .statistics import difference, estimate
+from .study import Baseline, Study
 from .tables import TextTable, group_starts
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
@@ -40,26 +41,58 @@ _PAIRED: Final = ("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "at
 """Metrics whose differences are in the table; the file has all."""
 
 
+def plan_of(
+    logs: Path,
+    estimators: Sequence[str] = (),
+    reference: str | None = None,
+    settings: MapperSettings | None = None,
+    ghosts: GhostSettings | None = None,
+) -> Plan:
+    """Return the plan of every estimator, or those named, on a log or a folder of logs.
+
+    The others are compared with the reference: the default estimator if it is among them, or else the first.
+    """
+    known = registry.known_estimators()
+    for name in estimators:
+        check_name(name, known, "--estimators: expected a known estimator")
+    chosen = tuple(dict.fromkeys(estimators or known))
+    if reference is not None:
+        check_name(reference, chosen, "--reference: expected an estimator that is compared")
+    default = registry.DEFAULT_ONLINE if registry.DEFAULT_ONLINE in chosen else chosen[0]
+    study = Study(
+        name="comparison",
+        logs={name: (folder,) for name, folder in log_folders(logs).items()},
+        estimators=chosen,
+        settings=settings or MapperSettings(),
+        baseline=Baseline(estimator=reference or default),
+    )
+    return make_plan(study, keep=True, ghosts=ghosts)
+
+
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All outcomes, log by log; the estimators are compared with one of them, the reference."""
+    """All results, log by log; the estimators are compared with one of them, the reference."""
 
-    logs: tuple[NamedLog, ...]
-    estimators: tuple[str, ...]
-    reference: str
-    outcomes: tuple[Outcome, ...] = ()
+    plan: Plan
+    records: Mapping[str, Record]  # by the cell
+    folder: Path  # of the files of the runs
+
+    @cached_property
+    def results(self) -> tuple[tuple[EstimatorCell, Record], ...]:
+        return tuple((cell, self.records[cell.id]) for cell in self.plan.cells)
 
     @cached_property
     def frame(self) -> pd.DataFrame:
         """Tidy row per run and lap, and one per run for the whole log."""
         rows: list[dict[str, Any]] = []
-        for outcome in self.outcomes:
-            laps = 0 if outcome.result is None else outcome.result.laps
-            for row in outcome.rows:
-                about = {"scope": "lap" if row.lap else "log", "lap": row.lap or laps}
-                rows.append({**outcome.names, **about, **row.values})
+        for cell, record in self.results:
+            for row in record["rows"]:
+                about = {"scope": "lap" if row["lap"] else "log", "lap": row["lap"] or record["lap_count"]}
+                rows.append({**row, **_names(cell), **about})
         add_batch(rows, ("log",))
-        return pd.DataFrame(rows, columns=None if rows else [*RUN, "scope", "lap"])
+        order = [*RUN, "scope", "lap", *METRICS]
+        known = [name for name in order if name in order[:4] or any(name in row for row in rows)]
+        return pd.DataFrame(rows, columns=known)
 
     @property
     def final(self) -> pd.DataFrame:
@@ -67,13 +100,26 @@ class Comparison:
 
     def times(self) -> pd.DataFrame:
         """Return a tidy row per run and stage, in s."""
-        ran = [(outcome.names, outcome.result) for outcome in self.outcomes if outcome.result is not None]
-        rows = [{**names, **stage} for names, run in ran for stage in stage_times(online_cycles(run))]
+        rows = [
+            {**_names(cell), **stage} for cell, record in self.results for stage in record.get("stages", ())
+        ]
         return pd.DataFrame(rows, columns=[*RUN, "stage", "mean", "median", "p99", "share"])
 
     @property
+    def logs(self) -> tuple[str, ...]:
+        return tuple(self.plan.study.logs)
+
+    @property
+    def estimators(self) -> tuple[str, ...]:
+        return self.plan.study.estimators
+
+    @property
+    def reference(self) -> str:
+        return str(self.plan.study.baseline.estimator)
+
+    @cached_property
     def has_truth(self) -> bool:
-        return any(has_cones(named.log.truth) for named in self.logs)
+        return "rmse" in self.frame or any(has_cones(cell.drive.load()[0].truth) for cell in self.plan.cells)
 
     @property
     def paired(self) -> bool:
@@ -81,54 +127,26 @@ class Comparison:
         return len(self.logs) > 1 and len(self.estimators) > 1
 
     @property
-    def failures(self) -> list[Outcome]:
-        return [outcome for outcome in self.outcomes if outcome.failure]
+    def failures(self) -> list[dict[str, Any]]:
+        return [{**_names(cell), "error": one["failure"]} for cell, one in self.results if one["failure"]]
 
     @property
-    def unsettled(self) -> list[Outcome]:
-        """Outcomes of batches that did not converge."""
-        return [o for o in self.outcomes if isinstance(o.result, BatchRun) and not o.result.converged]
+    def unsettled(self) -> list[dict[str, Any]]:
+        """Names of the batches that did not converge."""
+        return [
+            _names(cell)
+            for cell, one in self.results
+            if one["rows"] and one["rows"][-1].get("converged") is False
+        ]
 
 
-def read_logs(folder: Path, limits: LimitSettings | None = None) -> tuple[NamedLog, ...]:
-    """Return the log of a log folder, or those of a folder of log folders; InputError if it is neither."""
-    folders = log_folders(folder)
-    read = {name: read_plausible_log(entry, limits or LimitSettings()) for name, entry in folders.items()}
-    return tuple(NamedLog(name, log, tuple(hints)) for name, (log, hints) in read.items())
+def compare(plan: Plan, folder: Path, **how: Any) -> Comparison:
+    """Run what is missing of a plan in a folder; `how` is that of `run_records`."""
+    return Comparison(plan, run_records(plan, folder, **how), folder)
 
 
-def choose(names: Sequence[str]) -> tuple[str, ...]:
-    """Return estimators by name, or all that are known if none is named; SettingsError if one is unknown."""
-    known = registry.known_estimators()
-    for name in names:
-        check_name(name, known, "--estimators: expected a known estimator")
-    return tuple(dict.fromkeys(names or known))
-
-
-def choose_reference(name: str | None, estimators: Sequence[str]) -> str:
-    """Return the named one, or the default estimator if it is compared, or else the first."""
-    if name is None:
-        return registry.DEFAULT_ONLINE if registry.DEFAULT_ONLINE in estimators else estimators[0]
-    check_name(name, estimators, "--reference: expected an estimator that is compared")
-    return name
-
-
-def compare(
-    logs: Sequence[NamedLog],
-    estimators: Sequence[str],
-    settings: MapperSettings | None = None,
-    *,
-    reference: str | None = None,
-    ghosts: GhostSettings | None = None,
-    jobs: int = 1,
-    on_run: OnCell | None = None,
-) -> Comparison:
-    """Run every estimator on every log, `jobs` at a time; a failure of one does not stop the others."""
-    settings, measured = settings or MapperSettings(), {"ghost_settings": ghosts}
-    cells = [Cell(log, name, settings, measured=measured) for log in logs for name in estimators]
-    found = run_cells(cells, run_cell, Outcome.failed, jobs=jobs, on_cell=on_run)
-    chosen = choose_reference(reference, estimators)
-    return Comparison(tuple(logs), tuple(estimators), chosen, tuple(found))
+def _names(cell: EstimatorCell) -> dict[str, Any]:
+    return {"log": cell.names["track"], "estimator": cell.estimator}
 
 
 # --- tables ----------------------------------------------------------------------------------------------
@@ -236,7 +254,7 @@ def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
 
 def _title(comparison: Comparison, when: str) -> str:
     count = len(comparison.logs)
-    logs = comparison.logs[0].name if count == 1 else f"mean over {count} logs"
+    logs = comparison.logs[0] if count == 1 else f"mean over {count} logs"
     missing = " (the log has no true cones, which rmse, missed and most other metrics need)"
     return f"{logs}, {when}{'' if comparison.has_truth else missing}"
 
@@ -251,7 +269,7 @@ def _cell(metric: Metric, row: dict[Any, Any]) -> str:
 # --- files -----------------------------------------------------------------------------------------------
 
 
-def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings, jobs: int) -> None:
+def write_comparison(out: Path, comparison: Comparison, jobs: int) -> None:
     """Write all files of a comparison (docs/formats.md), or on failure none.
 
     Each of several logs has a folder of its own. An earlier comparison in `out` becomes a numbered backup.
@@ -261,35 +279,38 @@ def write_comparison(out: Path, comparison: Comparison, settings: MapperSettings
         frames["paired"] = paired_frame(comparison)
     with atomic_folder(out, MARKER) as folder:
         for name, table in tables(comparison).items():
-            write_text(folder / f"{name}.md", table.markdown())
-            write_text(folder / f"{name}.tex", table.latex())
+            table.write(folder, name, "md", "tex")
         for name, frame in frames.items():
             write_csv(folder / f"{name}.csv", frame)
-        for named in comparison.logs:
-            _write_log(folder if len(comparison.logs) == 1 else folder / named.name, named, comparison)
+        for log in comparison.logs:
+            _write_log(folder if len(comparison.logs) == 1 else folder / log, log, comparison)
         about = {
             "format": "pathspace-comparison/1",
-            "logs": [named.name for named in comparison.logs],
+            "logs": comparison.logs,
             "estimators": comparison.estimators,
             "reference": comparison.reference,
-            "failures": [{**o.names, "error": o.failure} for o in comparison.failures],
+            "failures": comparison.failures,
             "jobs": jobs,
-            "settings": asdict(settings),
+            "settings": asdict(comparison.plan.study.settings),
             "versions": versions(),
         }
         write_json(folder / MARKER, about)
 
 
-def _write_log(folder: Path, named: NamedLog, comparison: Comparison) -> None:
+def _write_log(folder: Path, name: str, comparison: Comparison) -> None:
+    """Copy the files of the runs on a log, and draw their maps."""
     folder.mkdir(exist_ok=True)
-    found = [outcome for outcome in comparison.outcomes if outcome.names["log"] == named.name]
-    maps = {str(o.names["estimator"]): o.result.map for o in found if o.result is not None}
-    for outcome in found:
-        if outcome.result is not None:
-            summary = summarize(outcome.result, named.log, named.hints)
-            write_result(folder / outcome.names["estimator"], outcome.result, summary)
-    if maps:
-        save_figures(folder, {"maps": plot_maps(found, named.log)})
-    if named.log.truth is not None and comparison.reference in maps:
-        figure = blind_spot_figure(maps, comparison.reference, named.log.truth)
+    drawn, truth = dict[str, Drawn](), None
+    for cell, record in comparison.results:
+        if cell.names["track"] != name or record["failure"]:
+            continue
+        run = shutil.copytree(run_folder(comparison.folder, cell), folder / cell.estimator)
+        file = next(run / name for name in (SMOOTHED_FILE, TRAJECTORY_FILE) if (run / name).exists())
+        drawn[cell.estimator] = Drawn(read_map(run), read_trajectory(file)[1], record["rows"][-1])
+        truth = cell.drive.load()[0].truth
+    if drawn:
+        save_figures(folder, {"maps": plot_maps(drawn, truth)})
+    if truth is not None and comparison.reference in drawn:
+        maps = {estimator: one.map for estimator, one in drawn.items()}
+        figure = blind_spot_figure(maps, comparison.reference, truth)
         save_figures(folder, {} if figure is None else {"blind_spot": figure})

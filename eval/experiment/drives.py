@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +25,7 @@ TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
 RECORDED: Final = "recorded"  # noise of a drive that was not simulated
 RESOLUTION: Final = 1e-3  # length (m) and angle (rad) to which the geometry of a track identifies it
 ROUNDING: Final = 1.0 / np.pi  # shift that keeps coordinates of few decimals off the edges of millimetres
-_latest: dict[str, Log] = {}  # the log that was simulated last, by its drive
+_latest: dict[str, tuple[Log, Sequence[Hint]]] = {}  # the log that was asked for last, by its drive
 
 
 def track_digest(track: Track) -> str:
@@ -68,12 +68,9 @@ class Drive:
         simulation = asdict(self.simulation)
         return identity(track=track_digest(self.track), seed=self.own_seed, simulation=simulation)
 
-    def load(self) -> Log:
-        """Return the log; the last one is kept, since cells are in the order of their logs."""
-        if self.id not in _latest:
-            _latest.clear()
-            _latest[self.id] = simulate(self.track, self.simulation, self.own_seed)
-        return _latest[self.id]
+    def load(self) -> tuple[Log, Sequence[Hint]]:
+        """Return the log, and its likely mistakes, of which it has none."""
+        return _kept(self.id, lambda: (simulate(self.track, self.simulation, self.own_seed), ()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +80,7 @@ class RecordedDrive:
     track: str
     seed: int  # number of the log on its track
     folder: Path
+    limits: LimitSettings  # of what is read
 
     @property
     def names(self) -> dict[str, Any]:
@@ -106,11 +104,20 @@ class RecordedDrive:
             digest.update(name.encode() + (file.read_bytes() if file.exists() else b""))
         return digest.hexdigest()[:20]
 
-    def load(self) -> Log:
-        if self.id not in _latest:
-            _latest.clear()
-            _latest[self.id] = read_plausible_log(self.folder, LimitSettings())[0]
-        return _latest[self.id]
+    def load(self) -> tuple[Log, Sequence[Hint]]:
+        """Return the log, and the mistakes that are likely in it."""
+        return _kept(self.id, lambda: read_plausible_log(self.folder, self.limits))
+
+
+AnyDrive = Drive | RecordedDrive
+
+
+def _kept(drive: str, load: Callable[[], tuple[Log, Sequence[Hint]]]) -> tuple[Log, Sequence[Hint]]:
+    """Return what `load` does, once for cells in the order of their drives."""
+    if drive not in _latest:
+        _latest.clear()
+        _latest[drive] = load()
+    return _latest[drive]
 
 
 def log_folders(folder: Path) -> dict[str, Path]:
@@ -160,26 +167,3 @@ def _load(track: Path | int, stems: list[str]) -> Track:
             raise InputError(track, str(error)) from error
     folder = f"{track.resolve().parent.name}/" if stems.count(track.stem) > 1 else ""
     return replace(read_track(track), name=f"{folder}{track.stem}")
-
-
-@dataclass(frozen=True, eq=False)
-class NamedLog:
-    """A log with the name of its folder, and the mistakes that are likely in it."""
-
-    name: str
-    log: Log
-    hints: tuple[Hint, ...] = ()
-
-    @property
-    def names(self) -> dict[str, Any]:
-        return {"log": self.name}
-
-    @cached_property
-    def id(self) -> str:
-        return identity(log=self.name)
-
-    def load(self) -> Log:
-        return self.log
-
-
-AnyDrive = Drive | RecordedDrive

@@ -18,7 +18,7 @@ from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.eval.figures import style
 from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, ORANGE, WIDTH
 from pathspace_graph.eval.metrics.metric import METRICS, UNKNOWN
-from pathspace_graph.io.files import write_json, write_text
+from pathspace_graph.io.files import write_json
 from pathspace_graph.plausibility.diagnosis import PRIOR_LIMIT
 
 from .frame import RUN, last_laps, write_csv, write_results
@@ -255,10 +255,8 @@ def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Write the results of every run, and the table, the values and the figure; return the table's text."""
     faults = outcomes(study, frame)
     table = fault_table(study, faults)
-    text = f"{table.title}\n\n{table.text()}\n"
     write_results(frame, out)
-    for suffix, content in (("txt", text), ("md", table.markdown()), ("tex", table.latex())):
-        write_text(out / f"faults.{suffix}", content)
+    table.write(out, "faults", "txt", "md", "tex")
     about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}
     write_json(out / "faults.json", {"format": "pathspace-faults/1", **about, "faults": faults}, indent=1)
     flat = pd.DataFrame(faults)
@@ -266,4 +264,4 @@ def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
         flat[key] = [json.dumps(value, ensure_ascii=False) for value in flat[key]]
     write_csv(out / "faults.csv", flat)
     style.save_figures(out, {"faults": plot_faults(study, beside_clean(frame))})
-    return text
+    return f"{table.title}\n\n{table.text()}\n"

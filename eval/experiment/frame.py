@@ -15,33 +15,44 @@ from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import replacing
 from pathspace_graph.io.overrides import leaves
 
-from .cells import Cell, Record
-from .drives import AnyDrive
+from .cells import EstimatorCell
+from .runner import Record
 from .statistics import LEVEL, Estimate, by_track, estimate, holm, paired_p, wilcoxon_p
 from .study import Study
 
 COMBINATION: Final = ("noise", "estimator", "variant")  # columns of a combination, which is compared
 RUN: Final = ("track", "seed")  # columns of a drive; combinations are paired on the same drive and noise
 RUN_OF: Final = (*RUN, *COMBINATION)
-TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)  # wall times
+TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
 MADE: Final = ("commit", "host", "processor", "blas", "date", "command")  # where and when a run was made
 
 
-def frame_of(study: Study, cells: Sequence[tuple[Cell[AnyDrive], Record | None]]) -> pd.DataFrame:
+def frame_of(study: Study, cells: Sequence[tuple[EstimatorCell, Record]]) -> pd.DataFrame:
     """Return a row for each run and lap, or one for a failed run; every varied setting is a column."""
     rows = []
     for cell, record in cells:
-        assert record is not None, "every cell has been run by now"
         shared = {"study": study.name} | cell.names | _settings_row(study, cell)
-        about = {"failure": record["failure"], "notices": record["notices"], **record["made"]}
+        about = {"failure": record["failure"], "notices": record.get("notices", ""), **record["made"]}
         about |= {"drive": cell.drive.source, "cell": cell.id}
-        rows += [shared | lap | about for lap in record["laps"]] or [shared | {"lap": None} | about]
+        rows += [shared | lap | about for lap in lap_rows(record["rows"])] or [shared | {"lap": None} | about]
     add_batch(rows, (*RUN, "noise", "variant"))
     settings = _settings_row(study, cells[0][0])
     order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "notices", *versions(), "drive", "cell"]
     known = dict.fromkeys([*order, *(name for row in rows for name in row)])
     frame = pd.DataFrame(rows, columns=[name for name in known if any(name in row for row in rows)])
     return frame.astype({"lap": "Int64"})
+
+
+def lap_rows(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row for each lap, with the metrics of the whole run, the last row, beside its own.
+
+    A run that completed no lap has one row, that of the whole run as lap 1.
+    """
+    if not rows:
+        return []
+    *laps, whole = rows
+    shared = {key: value for key, value in whole.items() if key != "lap" and METRICS[key].scope == "run"}
+    return [{**row, **shared} for row in laps] or [{**whole, "lap": 1}]
 
 
 def add_batch(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
@@ -57,7 +68,7 @@ def add_batch(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> None:
             row["rmse_by_batch"] = float(row["rmse"] / batch["rmse"])
 
 
-def _settings_row(study: Study, cell: Cell[AnyDrive]) -> dict[str, Any]:
+def _settings_row(study: Study, cell: EstimatorCell) -> dict[str, Any]:
     """Return the varied settings of a cell; one that its estimator does not have is None."""
     settings, simulated = leaves(cell.settings), cell.drive.simulation
     simulation = {} if simulated is None else leaves(simulated)
@@ -118,7 +129,8 @@ def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
     """Return every combination against the baseline of its noise, in the study's order.
 
     Nothing is tested where all differences are 0, as between cells that mean the same, nor of a wall time,
-    which depends on what else the machine does.
+    which depends on what else the machine does. The cells of a drive are run one after another, so that
+    processor times are.
     """
     known = last_laps(frame).astype({metric: float}).dropna(subset=[metric])
     runs = {key: of.set_index([*RUN])[metric] for key, of in known.groupby([*COMBINATION], sort=False)}
@@ -131,7 +143,7 @@ def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
         if key != base:
             d = by_track((values - against).dropna()).to_numpy()
             contrast = replace(contrast, difference=estimate(d), differences=tuple(d.tolist()))
-            if d.any() and not METRICS[metric].time:
+            if d.any() and METRICS[metric].time != "wall":
                 contrast = replace(contrast, p=paired_p(d), wilcoxon=wilcoxon_p(d))
         contrasted.append(contrast)
     corrected = holm(np.array([contrast.p for contrast in contrasted]))

@@ -15,11 +15,9 @@ from pathspace_graph.eval.figures.style import RED, WIDTH
 from pathspace_graph.eval.metrics.accuracy import MISSED_DISTANCE, cone_distances, mapped_points
 from pathspace_graph.eval.metrics.metric import PAPER
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES
-
-from .cells import Outcome
 
 COLUMNS: Final = (2, 3, 4)  # maps side by side; the first with which the figure fits a page is taken
 MAX_HEIGHT: Final = 10.0  # height of a page (in)
@@ -75,20 +73,34 @@ def blind_spot_figure(maps: Mapping[str, Map], reference: str, truth: Truth) -> 
     return None
 
 
-def plot_maps(outcomes: Sequence[Outcome], log: Log) -> Figure:
-    """Draw a panel for each map over the truth, all of the area of the true cones, or else of all maps."""
-    drawn = [(outcome, outcome.result.map) for outcome in outcomes if outcome.result is not None]
-    points = [] if log.truth is None else [log.truth.cones]
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A map with the driven path (n, 3), map frame, and its metrics at the end of the log by their keys."""
+
+    map: Map
+    path: Array
+    metrics: Mapping[str, Any]
+
+
+def plot_maps(drawn: Mapping[str, Drawn], truth: Truth | None) -> Figure:
+    """Draw a panel for the map of each estimator over the truth, with the driven path.
+
+    All are of the area of the true cones, or else of all maps.
+    """
+    points = [] if truth is None else [truth.cones]
     if not sum(map(len, points)):
-        points = [mapped_points(boundary) for _, track in drawn for boundary in track.boundaries.values()]
+        points = [
+            mapped_points(boundary) for one in drawn.values() for boundary in one.map.boundaries.values()
+        ]
     together = np.concatenate([np.zeros((1, 2)), *points])
     low, high = together.min(axis=0) - MARGIN, together.max(axis=0) + MARGIN
     with style.figure_context():
         figure, panels, columns = _panels(len(drawn), (high - low) / 2.0)
-        for axes, (outcome, track) in zip(panels, drawn, strict=False):
-            _draw_map(axes, track, log.truth, WHOLE_TRACK)
+        for axes, (name, one) in zip(panels, drawn.items(), strict=False):
+            _draw_map(axes, one.map, truth, WHOLE_TRACK)
+            map_plot.draw_trajectory(axes, one.path, WHOLE_TRACK)
             map_plot.draw_start(axes, WHOLE_TRACK)
-            axes.set_title(_caption(outcome))
+            axes.set_title(_caption(name, one.metrics))
             style.set_frame(axes, low, high)
         _finish(figure, panels, len(drawn), columns)
     return figure
@@ -145,7 +157,7 @@ def _draw_map(axes: Axes, track: Map, truth: Truth | None, look: MapStyle) -> No
         map_plot.draw_truth(axes, truth, look)
 
 
-def _caption(outcome: Outcome) -> str:
-    row = outcome.rows[-1].values
-    *words, size = (f"{m.title} {m.text(float(row[m.key]))} {m.unit}".strip() for m in PAPER if m.key in row)
-    return "\n".join([outcome.names["estimator"], ", ".join(words), size])
+def _caption(name: str, row: Mapping[str, Any]) -> str:
+    known = [m for m in PAPER if row.get(m.key) is not None]
+    *words, size = (f"{m.title} {m.text(float(row[m.key]))} {m.unit}".strip() for m in known)
+    return "\n".join(filter(None, [name, ", ".join(words), size]))

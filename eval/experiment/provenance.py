@@ -33,7 +33,12 @@ Code = dict[str, str]  # digest of each source by its module, and version of eac
 
 def code_of(estimator: str) -> Code:
     """Return what a result of an estimator depends on: its sources, those of the metrics, libraries."""
-    return _code((registry.module_of(estimator), *(f"{HOUSE}.{module}" for module in MEASURED)))
+    return code_from(registry.module_of(estimator))
+
+
+def code_from(module: str) -> Code:
+    """Return what a result of what is in a module depends on."""
+    return _code((module, *(f"{HOUSE}.{one}" for one in MEASURED)))
 
 
 @cache
@@ -115,15 +120,15 @@ def _library_versions(names: set[str]) -> Code:
     return {distribution: version(distribution) for distribution in sorted(distributions)}
 
 
-def check_code(estimator: str, expected: Code, began: str) -> None:
+def check_code(module: str, expected: Code, began: str) -> None:
     """Raise a SettingsError that names both unless this process has the code with which a study began."""
-    found = code_of(estimator)
+    found = code_from(module)
     if found == expected:
         return
     name = next(name for name in [*expected, *found] if expected.get(name) != found.get(name))
     own, other = (code.get(name, "missing") for code in (found, expected))
     raise SettingsError(
-        f"{estimator}: expected the code of {began}, where the study began, "
+        f"{module}: expected the code of {began}, where the study began, "
         f"with {name} {other}, found {name} {own} on {here()}"
     )
 
@@ -135,9 +140,9 @@ def here() -> str:
 # --- where and when ----------------------------------------------------------------------------------------
 
 
-def made(estimator: str) -> dict[str, Any]:
-    """Return where and when a result of an estimator is made, and with which libraries."""
-    packages = {HOUSE, registry.module_of(estimator).partition(".")[0]}
+def made(module: str) -> dict[str, Any]:
+    """Return where and when a result of what is in a module is made, and with which libraries."""
+    packages = {HOUSE, module.partition(".")[0]}
     commits = {name: commit for name in sorted(packages) if (commit := commit_of(_folder(name)))}
     now = datetime.now(UTC).isoformat(timespec="seconds")
     return {

@@ -55,6 +55,8 @@ class Study:
     question: str = ""
     estimators: tuple[str, ...] = (registry.DEFAULT_ONLINE,)
     """Estimators to run, online and batch ones; `all` stands for every one."""
+    settings: MapperSettings = field(default_factory=MapperSettings)
+    """Settings of every estimator, which variants override."""
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
     """Overrides of the simulation by the name of a noise."""
     variants: Mapping[str, Overrides] = field(default_factory=dict)
@@ -131,6 +133,15 @@ class Study:
         chosen = {group: overrides.pop(f"{group}.{PRESET}", PLAIN) for group in PRESETS}
         return replace(override(preset(chosen), overrides, f"noise.{noise}"), laps=self.laps)
 
+    def against(self, baseline: str) -> "Study":
+        """Return the study with a variant or an estimator as the baseline; SettingsError if it has none."""
+        if baseline in self.estimators:
+            return replace(self, baseline=Baseline(estimator=baseline))
+        check_name(
+            baseline, [*self._named(), *self.estimators], "--baseline: expected a variant or an estimator"
+        )
+        return replace(self, baseline=Baseline(baseline))
+
     @property
     def points(self) -> dict[str, Variant]:
         """Variants to run by name; of those that are equal the first."""
@@ -179,7 +190,7 @@ class Study:
                 of = [key for key in rest if key.startswith(f"{name}.")]
                 own = {key.removeprefix(f"{name}."): rest.pop(key) for key in of}
                 parameters.append((name, override(default, own, f"{where}.{name}")))
-        return Variant(override(MapperSettings(), rest, where), tuple(parameters))
+        return Variant(override(self.settings, rest, where), tuple(parameters))
 
 
 def _grid(grid: Mapping[str, Sequence[Any]]) -> dict[str, Overrides]:
@@ -236,6 +247,9 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
     values["tracks"] = tuple(folder / t if isinstance(t, str) else t for t in values.get("tracks", ()))
     if "drives" in values:
         values["logs"] = _logs(_typed("drives", values.pop("drives"), Mapping), folder)
+    if "settings" in values:
+        overrides = flatten(_typed("settings", values["settings"], Mapping))
+        values["settings"] = override(MapperSettings(), overrides, "settings")
     for key in (key for key in ("noise", "variants") if key in values):
         tables = _typed(key, values[key], Mapping).items()
         values[key] = {k: flatten(_typed(f"{key}.{k}", v, Mapping)) for k, v in tables}

@@ -102,6 +102,13 @@ class TextTable:
         table = _with(self._formatted("latex_booktabs", rows), r"\textbf{", "}")
         return "\n".join([*begin, table, r"\end{table}", ""]).translate(_UNICODE)
 
+    def write(self, folder: Path, name: str, *suffixes: str) -> None:
+        """Write the table to a folder as `txt` (with its title), `md` or `tex`."""
+        title = f"{self.title}\n\n" if self.title else ""
+        forms = {"txt": lambda: f"{title}{self.text()}\n", "md": self.markdown, "tex": self.latex}
+        for suffix in suffixes:
+            write_text(folder / f"{name}.{suffix}", forms[suffix]())
+
     def _formatted(self, style: str, rows: Sequence[Sequence[str] | str]) -> str:
         sides = ["left"] * self.names + ["right"] * (len(self.header) - self.names)
         return str(tabulate(rows, self.header, tablefmt=style, colalign=sides, disable_numparse=True))
@@ -272,7 +279,7 @@ def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     tables, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
     for suffix, form in (("txt", as_text), ("md", as_markdown), ("tex", as_latex)):
         write_text(out / f"summary.{suffix}", form(tables, note))
-    write_text(out / "table.tex", results_table(study, frame).latex())
+    results_table(study, frame).write(out, "table", "tex")
     figure = plot_differences(study, frame)
     save_figures(out / "figures", {} if figure is None else {"differences": figure})
     return as_text(tables, note)

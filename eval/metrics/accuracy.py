@@ -52,7 +52,6 @@ def cone_errors(track: Map, truth: Truth) -> dict[str, float]:
     return {
         "rmse": root_mean_square(distances[distances <= MISSED_DISTANCE]),
         "missed": mean_of(distances > MISSED_DISTANCE),
-        "cones": count,
         "size_share": track.size / count if count else float("nan"),
         "missed_2m": mean_of(distances > 2.0),
         "missed_1m": mean_of(distances > 1.0),

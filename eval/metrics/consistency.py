@@ -1,7 +1,6 @@
 """Whether a covariance is honest: NEES of the map, errors at the true cones, turn and scale."""
 
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 import scipy  # which imports its modules when they are used
@@ -9,16 +8,13 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
-from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.residuals import chi2_quantile, greville
+from pathspace_graph.factors.residuals import greville
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 
 from .accuracy import MISSED_DISTANCE, closest_points, cones_of, mean_of, true_curve
-
-LEVEL: Final = 0.95  # probability with which an honest map's NEES lies in the interval
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,19 +32,6 @@ class NormalizedError:
     def ratio(self) -> float:
         """Return the value per degree of freedom: 1 is honest, more overconfident, less too cautious."""
         return self.value / self.dof if self.dof else float("nan")
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Return the two-sided 95 % interval of `ratio` for an honest covariance."""
-        if not self.dof:
-            return float("nan"), float("nan")
-        low, high = (chi2_quantile(0.5 * (1.0 + sign * LEVEL), self.dof) for sign in (-1.0, 1.0))
-        return low / self.dof, high / self.dof
-
-    @property
-    def honest(self) -> bool:
-        low, high = self.interval
-        return low <= self.ratio <= high
 
 
 def _squared(error: Array, covariance: Array) -> float:
@@ -68,7 +51,7 @@ def map_nees(track: Map, truth: Truth) -> NormalizedError:
     across itself; that of landmarks is their offset in the plane. The map that a user gets is judged, so
     every estimator is judged alike. A map holds no covariance between its boundaries, so errors that they
     share (above all its heading) count twice: the mean of `ratio` over many runs is right, but it spreads
-    more widely than its interval.
+    more widely than a chi-squared one.
     """
     value, dof = 0.0, 0
     for label, boundary in track.boundaries.items():
@@ -138,29 +121,6 @@ def normal_errors(track: Map, truth: Truth) -> tuple[Array, Array]:
             errors.append(feet.distance)
             sigmas.append(boundary.spline.normal_sigma(feet.u, boundary.covariance))
     return np.concatenate(errors), np.concatenate(sigmas)
-
-
-def joint_cone_error(result: BatchResult, truth: Truth) -> NormalizedError:
-    """Return e' (B Sigma B' + diag(s^2))^-1 e, the errors of both curves at all true cones at once.
-
-    Unlike in the NEES of the map, Sigma is joint over both boundaries and of the detections, and s the
-    scatter of cones about a smooth curve: this judges whether the batch itself predicts the true cones.
-    """
-    errors, sigmas, designs, offset = [np.zeros(0)], [np.zeros(0)], [], 0
-    size = len(result.map_covariance)
-    for label, boundary in sorted(result.map.boundaries.items()):
-        assert isinstance(boundary, SplineBoundary)
-        feet = closest_points(boundary.spline, cones_of(truth, label))
-        design = np.zeros((len(feet.u), size))
-        by_point = np.einsum("km,kd->kmd", boundary.spline.basis_matrix(feet.u), feet.normal_unit)
-        design[:, offset : offset + 2 * boundary.size] = by_point.reshape(len(feet.u), -1)
-        errors.append(feet.distance)
-        sigmas.append(result.scatter.sigma(label, feet.u))
-        designs.append(design)
-        offset += 2 * boundary.size
-    e, B = np.concatenate(errors), np.concatenate([np.zeros((0, size)), *designs])
-    covariance = B @ result.map_covariance @ B.T + np.diag(np.concatenate(sigmas) ** 2)
-    return NormalizedError(_squared(e, covariance), len(e))
 
 
 def with_marginals(track: Map) -> Map:

@@ -6,7 +6,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import seen_cycles
 from pathspace_graph.health import DEGRADED, LOST
@@ -21,7 +20,6 @@ from .accuracy import GhostSettings, true_lap_ends
 from .consistency import (
     aligned,
     consistency_at_cones,
-    joint_cone_error,
     map_nees,
     similarity_from_truth,
     turn_from_truth,
@@ -79,31 +77,26 @@ class Row:
 def measure(
     run: RunResult,
     log: Log,
-    seconds: float | None = None,
+    took: tuple[float, float] | None = None,
     ghost_settings: GhostSettings | None = None,
     *,
-    marginals: bool = False,
     reference_limits: bool = False,
-    whole: bool = True,
 ) -> list[Row]:
     """Return a row for each complete lap, and one for the whole run as the last; lengths are over the scale.
 
     A lap's row has the map as it stood at its end, and the poses and updates of its cycles. Laps are the true
     ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and so one
-    row, that of the last lap. `seconds` is the wall time of the whole run. `marginals` asks for the metrics
-    of the paper's squared basis, `reference_limits` for `l`, `f` and `limit`, by a batch with oracle
-    association (ValueError without associations). Without `whole` the last row has the metrics that laps
-    have only where there is no lap.
+    row, that of the last lap. `took` is the wall time and the processor time of the whole run (s).
+    `reference_limits` asks for `l` and `limit`, by a batch with oracle association (ValueError without
+    associations).
     """
     run, log = run.at_scale_one(), scaled(log, 1.0 / run.scale)
     rows = []
     for lap, track, begin, end in _laps(run, log):
-        of_map = _map_values(track, log.truth, ghost_settings, marginals)
+        of_map = _map_values(track, log.truth, ghost_settings)
         rows.append(Row(lap, of_map | _drive_values(run, log.truth, begin, end)))
-    values: dict[str, float] = {}
-    if whole or not rows:
-        values |= _map_values(run.map, log.truth, ghost_settings, marginals)
-        values |= _drive_values(run, log.truth, -np.inf, np.inf)
+    values = _map_values(run.map, log.truth, ghost_settings)
+    values |= _drive_values(run, log.truth, -np.inf, np.inf)
     values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log.truth)
     if not has_cones(log.truth):
         values |= _values_without_truth(run, log)
@@ -117,13 +110,10 @@ def measure(
         }
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
-    if isinstance(run, BatchResult) and has_cones(log.truth):
-        joint = joint_cone_error(run, log.truth)
-        values |= {"normalized_error_joint": joint.ratio, "normalized_error_joint_inside": joint.honest}
     if reference_limits:
         values |= limit(log, run.map)
-    if seconds is not None:
-        values["seconds"] = seconds
+    if took is not None:
+        values["seconds"], values["seconds_processor"] = took
     return [*rows, Row(None, values)]
 
 
@@ -145,9 +135,7 @@ def _laps(run: RunResult, log: Log) -> Iterator[tuple[int, Map, float, float]]:
         yield lap, track, ends[index], ends[index + 1]
 
 
-def _map_values(
-    track: Map, truth: Truth | None, ghost_settings: GhostSettings | None, marginals: bool
-) -> dict[str, float]:
+def _map_values(track: Map, truth: Truth | None, ghost_settings: GhostSettings | None) -> dict[str, float]:
     """Return the metrics of a map as it stands; without true cones only those that need none."""
     values: dict[str, float] = {"size": track.size, "closed": bool(track.closed)}
     values |= {"bytes": map_bytes(track), "bytes_covariance": covariance_bytes(track)}
@@ -157,10 +145,8 @@ def _map_values(
     values |= accuracy.ghosts(track, truth, ghost_settings)
     values |= _consistency_values(track, truth) | _centre_values(track, truth)
     values |= _whole_map_values(track, truth)
-    if marginals:
-        found = consistency_at_cones(with_marginals(track), truth)
-        values |= {f"{key}_marginals": found[key] for key in ("inside", "normalized_error")}
-    return values
+    found = consistency_at_cones(with_marginals(track), truth)
+    return values | {f"{key}_marginals": value for key, value in found.items()}
 
 
 def _whole_map_values(track: Map, truth: Truth) -> dict[str, float]:
@@ -175,10 +161,7 @@ def _whole_map_values(track: Map, truth: Truth) -> dict[str, float]:
 
 
 def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
-    nees = map_nees(track, truth)
-    values = {"nees": nees.ratio}
-    values |= {} if np.isnan(nees.ratio) else {"nees_inside": nees.honest}
-    return values | consistency_at_cones(track, truth)
+    return {"nees": map_nees(track, truth).ratio} | consistency_at_cones(track, truth)
 
 
 def _centre_values(track: Map, truth: Truth) -> dict[str, float]:
@@ -245,8 +228,10 @@ def _drive_values(run: RunResult, truth: Truth | None, begin: float, end: float)
         values["along"], values["across"] = (accuracy.root_mean_square(column) for column in errors[:, :2].T)
         if run.reach is not None:
             values |= trajectory.reach_values(run.reach[inside])
-    for whole in stage_times(online_cycles(run, begin, end))[:1]:
+    cycles = online_cycles(run, begin, end)
+    for whole in stage_times(cycles)[:1]:
         values |= {f"ms_{name}": 1e3 * whole[name] for name in ("mean", "p99")}
+        values["ms_processor"] = 1e3 * float(np.mean([record.processor for record in cycles]))
     return values
 
 

@@ -23,12 +23,12 @@ from .trajectory import pose_errors
 def limit(log: Log, track: Map) -> dict[str, float]:
     """Return the least error (m) to be expected of a simulated log and a map of it; ValueError for others.
 
-    `l` is the rmse in the plane of the landmark batch with oracle association, `f` that of the true cones to
-    splines of the mapped size that are fitted to them, `limit` both.
+    `l` is the rmse in the plane of the landmark batch with oracle association, `limit` that and the rmse of
+    the true cones to splines of the mapped size that are fitted to them.
     """
     truth = _truth(log)
     landmarks, fit = landmark_rmse(solve_oracle_landmarks(log)[1], truth), fit_rmse(track, truth)
-    return {"l": landmarks, "f": fit, "limit": float(np.hypot(landmarks, fit))}
+    return {"l": landmarks, "limit": float(np.hypot(landmarks, fit))}
 
 
 def solve_oracle_landmarks(log: Log) -> tuple[LandmarkSystem, LandmarkState]:

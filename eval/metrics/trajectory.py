@@ -77,24 +77,20 @@ def longest_divergence(t: Array, poses: Array, truth: Truth, since: float) -> di
 
 
 def vehicle_errors(state: VehicleState, t: float, truth: Truth) -> dict[str, float]:
-    """Return the calibration and the heading at a stamp (s): estimate, truth, claimed sigma and error.
+    """Return the calibration at the end, its truth, and errors by their claimed sigmas, as `KEY_by_sigma`.
 
-    `KEY_by_sigma` is the error by its claimed standard deviation. What the truth doesn't know is absent.
+    The heading is that at a stamp (s). What the truth doesn't know is absent.
     """
-    _, _, sigma_heading, sigma_scale, sigma_bias = state.sigmas.tolist()
     scale, bias = state.calibration.tolist()
-    values = {"scale": scale, "bias": bias, "scale_sigma": sigma_scale, "bias_sigma": sigma_bias}
-    values["heading_sigma"] = sigma_heading
-    errors = {}
+    values, errors = {"scale": scale, "bias": bias}, {}
     if truth.calibration is not None:
         values["scale_true"], values["bias_true"] = truth.calibration.tolist()
         errors = {"scale": scale - values["scale_true"], "bias": bias - values["bias_true"]}
     if len(truth.poses) and truth.pose_t[0] <= t <= truth.pose_t[-1]:
         ((_, _, heading),) = trajectory_errors(np.array([t]), state.pose[None], truth)
         errors["heading"] = float(heading)
-    for key, error in errors.items():
-        values |= {f"{key}_error": error, f"{key}_by_sigma": error / values[f"{key}_sigma"]}
-    return values
+    sigmas = dict(zip(("heading", "scale", "bias"), state.sigmas.tolist()[2:], strict=True))
+    return values | {f"{key}_by_sigma": error / sigmas[key] for key, error in errors.items()}
 
 
 def position_rms(errors: Array) -> float:

@@ -2,18 +2,18 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from joblib import Parallel, delayed
 from tyro.conf import Positional, arg
 
-from pathspace_graph.console import note, output, progress, say
+from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
 from pathspace_graph.eval.experiment import compare as experiment
 from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.experiment.compare import Comparison, compare, side_by_side
-from pathspace_graph.eval.experiment.run import check_jobs, workers
+from pathspace_graph.eval.experiment.runner import check_jobs, unfinished, workers
 from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import save_plot
 from pathspace_graph.eval.metrics.accuracy import GhostSettings
@@ -43,7 +43,8 @@ class Compare:
     The paper's table is printed, or without truth what can be said without it; files have all metrics.
     For several logs the tables have means, and differences from the reference, paired over the logs, with
     their 95 % confidence interval. An estimator that fails is reported and does not stop the others; the exit
-    code is 3 then.
+    code is 3 then. Finished runs are kept in `OUT.unfinished` until all are there, so that the same command
+    goes on where it was killed.
     """
 
     log: Positional[tuple[Path, ...]]
@@ -67,18 +68,16 @@ class Compare:
             return
         if len(self.log) != 1:
             raise SettingsError(f"LOG: expected one log, or two maps, found {len(self.log)} folders")
-        estimators = experiment.choose(self.estimators)
-        reference = experiment.choose_reference(self.reference, estimators)
+        plan = experiment.plan_of(self.log[0], self.estimators, self.reference, self.settings, self.ghosts)
         check_jobs(self.jobs)
         check_target(self.out, experiment.MARKER)
-        logs = experiment.read_logs(self.log[0], self.settings.limits)
-        for named in logs:
-            tell(named.hints, of=named.name if len(logs) > 1 else "")
-        with progress("comparing", len(logs) * len(estimators)) as advance:
-            how: dict[str, Any] = {"reference": reference, "ghosts": self.ghosts, "jobs": self.jobs}
-            comparison = compare(logs, estimators, self.settings, on_run=advance, **how)
-        with progress("writing"):
-            experiment.write_comparison(self.out, comparison, self.settings, self.jobs)
+        for drive in dict.fromkeys(cell.drive for cell in plan.cells):
+            tell(drive.load()[1], of=drive.source if len(plan.study.logs) > 1 else "")
+        with unfinished(self.out) as folder:
+            with progress("comparing", lines=LINES) as advance:
+                comparison = compare(plan, folder, jobs=self.jobs, on_cell=advance)
+            with progress("writing"):
+                experiment.write_comparison(self.out, comparison, self.jobs)
         self._report(comparison)
 
     def _report(self, comparison: Comparison) -> None:
@@ -89,10 +88,10 @@ class Compare:
             for part in table.parts(console.width):
                 console.print(part.rich())
         say(f"written to {self.out}")
-        told = [(outcome.names, "not converged") for outcome in comparison.unsettled]
-        told += [(outcome.names, f"failed, {outcome.failure}") for outcome in comparison.failures]
-        note(*(f"{names['estimator']} on {names['log']}: {what}" for names, what in told))
-        if comparison.failures:
+        note(*(f"{of['estimator']} on {of['log']}: not converged" for of in comparison.unsettled))
+        failures = comparison.failures
+        note(*(f"{of['estimator']} on {of['log']}: failed, {of['error']}" for of in failures))
+        if failures:
             raise SystemExit(FAILED)
 
 
@@ -125,7 +124,7 @@ class Demo:
 
 def map_with_both(log: Log, settings: MapperSettings) -> tuple[RunResult, RunResult]:
     """Return the spline graph's result and the landmark graph's, which runs in another process."""
-    with workers(2, None):  # with one job it would be run here, and first
+    with workers(2):  # with one job it would be run here, and first
         rival = Parallel(return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
         result = map_online(log, make_online(DEFAULT_ONLINE, settings, log))
         with progress(RIVAL):

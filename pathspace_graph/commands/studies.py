@@ -14,10 +14,10 @@ from pathspace_graph.estimators import DEFAULT_ONLINE, ONLINE, check_online
 from pathspace_graph.eval.benchmark import scaling as timing
 from pathspace_graph.eval.benchmark.roads import QUICK, ScalingSettings, make_drives
 from pathspace_graph.eval.benchmark.scaling import measure_scaling
-from pathspace_graph.eval.experiment.cells import of_other_code
 from pathspace_graph.eval.experiment.drives import log_folders
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
-from pathspace_graph.eval.experiment.run import check_jobs, make_plan, run_plan
+from pathspace_graph.eval.experiment.run import make_plan, run_plan
+from pathspace_graph.eval.experiment.runner import check_jobs, of_other_code, unfinished
 from pathspace_graph.eval.experiment.study import Study, find_study, read_study_file
 from pathspace_graph.eval.experiment.tables import write_study
 from pathspace_graph.eval.report import Plan, write_report
@@ -87,9 +87,13 @@ class Ablate(StudyCommand):
 
     study: Positional[Path]
     """TOML file of the study, or name of one that comes with the package."""
+    baseline: str | None = None
+    """Variant or estimator that the others are compared with, in place of the study's own; a finished study
+    gets new tables only."""
 
     def run(self) -> None:
-        self.execute(read_study_file(find_study(self.study)), write_study)
+        study = read_study_file(find_study(self.study))
+        self.execute(study if self.baseline is None else study.against(self.baseline), write_study)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +122,9 @@ class Scale:
 
     All run in this one process, cycle for cycle in turn, so that other work of the machine slows all of them
     alike. An estimator that takes longer than the budget is stopped there, and the table says so. Memory is
-    measured by tracemalloc, for Python and numpy, while the first lap of the closed road is mapped.
+    measured by tracemalloc, for Python and numpy, while the first lap of the closed road is mapped. Finished
+    sweeps are kept in `OUT.unfinished` until all are there, so that the same command goes on where it was
+    killed.
     """
 
     out: Path
@@ -143,9 +149,10 @@ class Scale:
         measured = QUICK if self.quick else self.scaling
         with progress("simulating"):
             drives = make_drives(measured)
-        with progress("timing", drives.cycles) as advance:
-            scaling = measure_scaling(names, drives, measured, self.settings, advance)
-        timing.write_scaling(self.out, scaling)
+        with unfinished(self.out) as folder:
+            with progress("timing", drives.cycles, lines=LINES) as advance:
+                scaling = measure_scaling(names, drives, measured, self.settings, folder, advance)
+            timing.write_scaling(self.out, scaling)
         output(wide=True).print(timing.scaling_table(scaling).rich())
         say(*timing.stops(scaling), f"written to {self.out}")
 

@@ -63,7 +63,7 @@ class FrontEnd(Copyable):
     def __init__(self, settings: MapperSettings, noise: KnownNoise, scale: float = 1.0) -> None:
         """Start with the noise known at scale 1; lengths of the cycles are divided by `scale`."""
         self.noise = NoiseLearner(noise, settings.noise, of_lines=settings.kind == "line")
-        self.gate = Gate(settings.limits, scale)
+        self.gate = Gate(settings.limits, scale, of_lines=settings.kind == "line")
         self._motion = MotionCheck(self.noise.twist_sigma, settings.motion)
         self._settings = settings
         self._begun = self._sensor_doubted = False

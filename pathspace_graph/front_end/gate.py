@@ -33,12 +33,15 @@ from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.online import LimitSettings
 
+from .kind import kind_of
+
 TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
 LATEST_STAMP: Final = 1e11  # largest stamp (s), 3000 years: stamps in nanoseconds are larger
 IN_SECONDS: Final = "stamps are in seconds"  # hint for stamps in milli- or nanoseconds
 STAMPS: Final = f"at most {LATEST_STAMP:g} s ({IN_SECONDS})"
 MAX_TWISTS: Final = 100_000  # largest number of twists in a cycle, which bounds its time
 MOST_DETECTIONS: Final = 500  # largest number of detections in a cycle, which bounds its time
+MOST_POINTS: Final = 10_000  # largest number of points of lines in a cycle, thinned to that of detections
 MIN_RANGE: Final = 0.01  # least distance of a detection from the vehicle (m)
 MIN_SIGMA: Final = 1e-6  # least standard deviation of a detection in any direction (m)
 MAX_SIGMA: Final = 100.0  # largest standard deviation of a detection in any direction (m)
@@ -78,8 +81,10 @@ class Admitted:
 class Gate(Copyable):
     """Checks of each cycle, and the number of refused cycles."""
 
-    def __init__(self, limits: LimitSettings, scale: float = 1.0) -> None:
+    def __init__(self, limits: LimitSettings, scale: float = 1.0, *, of_lines: bool = False) -> None:
+        """Take limits at scale 1, the scene's scale, and whether all detections are points of lines."""
         self.scale = scale
+        self._most = MOST_POINTS if of_lines else MOST_DETECTIONS
         self.limits = scaled(limits, scale)  # in metres of the scene
         self.refused = 0  # number of cycles refused since the last admitted one
         self._refused_at: float | None = None  # stamp (s) of the previous cycle, if it was refused
@@ -98,7 +103,7 @@ class Gate(Copyable):
             silence = inf  # it follows the cycle just refused: two consistent cycles end a silence
         t = _stamp(_of_type(Detections, detections, "detections").t)
         try:
-            possible, notice = possible_detections(detections, t, self.limits, self.scale)
+            possible, notice = possible_detections(detections, t, self.limits, self.scale, self._most)
             stamps, twists = _checked_twists(_of_type(Odometry, odometry, "odometry"), self.limits)
             _check_order(stamps, t, newest.t, silence)
         except ReadingError as error:
@@ -107,7 +112,7 @@ class Gate(Copyable):
         self.refused, self._refused_at, self._dropping = 0, None, dropped > 0
         to_one = 1.0 / self.scale
         since = _since(scaled(Odometry(stamps, twists), to_one), newest)
-        return Admitted(since, scaled(possible, to_one), dropped, refused, notice, self.scale)
+        return Admitted(since, scaled(thinned(possible), to_one), dropped, refused, notice, self.scale)
 
     def refuse(self) -> None:
         self.refused += 1
@@ -116,7 +121,7 @@ class Gate(Copyable):
 def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
     """Read a log and check all its cycles; an unusable one raises an InputError with file, row and stamp."""
     log, newest = read_log(folder), Newest()
-    gate = Gate(limits, scale_of(log))
+    gate = Gate(limits, scale_of(log), of_lines=kind_of(log) == "line")
     for odometry, detections in split_odometry(log):
         try:
             admitted = gate.admit(odometry, detections, newest)
@@ -207,18 +212,18 @@ def _since(odometry: Odometry, newest: Newest) -> Odometry:
 
 
 def possible_detections(
-    detections: Detections, t: float, limits: LimitSettings, scale: float
+    detections: Detections, t: float, limits: LimitSettings, scale: float, most: int = MOST_DETECTIONS
 ) -> tuple[Detections, str]:
     """Return the possible detections of a cycle at t (s), and a notice about the others.
 
-    Detections and limits are in metres of a scene of this scale.
+    Detections and limits are in metres of a scene of this scale. More than `most` are refused.
     """
     points = _numbers(detections.points_vehicle, "detections.points_vehicle", (-1, 2))
     count = len(points)
     covariances = _numbers(detections.covariances, "detections.covariances", (count, 2, 2))
     labels = _labels(detections.labels, count)
-    if count > MOST_DETECTIONS:
-        raise ReadingError("detections.points_vehicle", f"at most {MOST_DETECTIONS} rows", count)
+    if count > most:
+        raise ReadingError("detections.points_vehicle", f"at most {most} rows", count)
     ranges, sigmas = (MIN_RANGE * scale, limits.range_max), (MIN_SIGMA * scale, MAX_SIGMA * scale)
     near, definite = kernels.usable(points, covariances, (*ranges, MOST_ASYMMETRY, MIN_DETERMINANT, *sigmas))
     good = near & definite
@@ -235,6 +240,12 @@ def possible_detections(
     dropped = f"{count - int(good.sum())} of {count} detections dropped"
     notice = f"{dropped}: expected {expected}, found {found} in row {row}"
     return Detections(t, points[good], covariances[good], labels[good]), notice
+
+
+def thinned(detections: Detections) -> Detections:
+    """At most `MOST_DETECTIONS` of the detections, one of every few where there are more."""
+    count = len(detections.labels)
+    return detections.where(np.arange(count) % max(-(-count // MOST_DETECTIONS), 1) == 0)
 
 
 def _labels(values: Any, count: int) -> IntArray:

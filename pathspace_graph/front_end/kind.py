@@ -7,6 +7,7 @@ points, whatever the gap.
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import Final, Self
 
 import numpy as np
@@ -162,8 +163,11 @@ class KindJudge:
         ]
 
 
+@lru_cache(maxsize=1)  # several ask about the log that was read last
 def kind_of(log: Log) -> Kind | None:
-    """Return the kind of a log's sensor, which its first seconds tell; None where they don't."""
+    """Kind of a log's sensor, as the log states it or by its first seconds; None where neither tells it."""
+    if log.sensor.kind:
+        return log.sensor.kind
     judge = KindJudge()
     for odometry, detections in split_odometry(log):
         judge.see(odometry, detections)
@@ -177,5 +181,5 @@ def with_kind(settings: MapperSettings, log: Log) -> MapperSettings:
 
     Lines have no stations.
     """
-    settings = replace(settings, kind=settings.kind or log.sensor.kind or kind_of(log))
+    settings = replace(settings, kind=settings.kind or kind_of(log))
     return replace(settings, stations=False) if settings.lines else settings

@@ -5,6 +5,7 @@ are spread most. Only the distance across it counts, so what a line cannot tell,
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -56,6 +57,17 @@ def _means(values: Array, cell: IntArray, counts: IntArray) -> Array:
     return np.column_stack([np.bincount(cell.ravel(), column) for column in values.T]) / counts[:, None]
 
 
+class Seen(NamedTuple):
+    """Detections of a cycle as they are matched."""
+
+    points: Array  # (m, 2) corrected, vehicle frame (m)
+    variances: Array  # (m,) of one coordinate (m^2)
+    is_line: BoolArray  # (m,) whether they are points of a line
+
+    def where(self, chosen: BoolArray) -> "Seen":
+        return Seen(self.points[chosen], self.variances[chosen], self.is_line[chosen])
+
+
 class Limits(NamedTuple):
     """Limits of a match, as `scan_matching` has them for cones."""
 
@@ -81,7 +93,8 @@ def targets_on_lines(placed: Array, recent: Array, reach: float, farthest: float
     near, points = placed - centre, recent - centre
     x, y = points.T
     square = (near**2).sum(axis=1)[:, None] + (points**2).sum(axis=1) - 2.0 * near @ points.T
-    weight = np.where(square < (farthest * reach) ** 2, np.exp(-0.5 * square / reach**2), 0.0)
+    beside, weight = square < (farthest * reach) ** 2, np.zeros(square.shape)
+    weight[beside] = np.exp(-0.5 * square[beside] / reach**2)
     total = np.maximum(weight.sum(axis=1), np.finfo(float).tiny)
     means = weight @ np.column_stack([x, y, x * x, x * y, y * y]) / total[:, None]
     mean, (xx, xy, yy) = means[:, :2], means[:, 2:].T
@@ -96,106 +109,75 @@ def targets_on_lines(placed: Array, recent: Array, reach: float, farthest: float
     return Targets(off, total, left_of(tangents), matched)
 
 
-def targets_on_cones(placed: Array, recent: Array, reach: float, limits: Limits) -> Targets:
-    """Return the means of the recent points (n, 2) of cones beside placed points (m, 2)."""
-    means, weights = kernels.weighted_means(placed, recent, reach, limits.farthest)
-    return Targets(placed - means, weights, np.zeros(placed.shape), np.asarray(weights > limits.weight))
+@dataclass(frozen=True, eq=False)
+class LineMatch:
+    """Detections of a cycle beside recent ones, of cones and of lines."""
 
+    cones: Array  # (n, 2) recent points of cones (m)
+    lines: Array  # (k, 2) recent points of lines (m)
+    seen: Seen
+    limits: Limits
 
-def match_lines(
-    recent: tuple[Array, Array],
-    seen: tuple[Array, Array, BoolArray],
-    start: Array,
-    reaches: Sequence[float],
-    limits: Limits,
-) -> tuple[Array, Array, BoolArray, float]:
-    """Lay detections on recent points of cones (n, 2) and of lines (k, 2), by Gauss-Newton steps.
+    def found(self, start: Array, reaches: Sequence[float]) -> tuple[Array, Array, BoolArray, float]:
+        """Lay the detections on the recent points by Gauss-Newton steps from a pose (3,), one for each reach.
 
-    Detections are points (m, 2), vehicle frame, with variances (m,) of one coordinate (m^2), and whether each
-    is of a line. The result is the pose (3,), its information (3, 3), which detections were matched, and the
-    sum of their whitened squares.
-    """
-    pose, turn = start.copy(), np.eye(3)  # from the vehicle's frame at the start
-    turn[:2, :2] = rotation(start[2])
-    held = turn @ np.diag(1.0 / LINE_HELD) @ turn.T
-    for reach in reaches:
-        hessian, gradient, *_ = _system(recent, seen, pose, reach, limits)
-        pose = pose - np.linalg.solve(hessian + held, gradient + held @ (pose - start))
-    hessian, _, matched, square = _system(recent, seen, pose, reaches[-1], limits)
-    if matched.sum() < limits.fewest:
-        return pose, np.zeros((3, 3)), matched, square
-    covariance = np.linalg.inv(hessian + held) + turn @ np.diag(LINES_ALIKE) @ turn.T
-    return pose, np.asarray(np.linalg.inv(covariance)), matched, square
+        The result is the pose (3,), its information (3, 3), which detections were matched, and the sum of
+        their whitened squares.
+        """
+        pose, turn = start.copy(), np.eye(3)  # from the vehicle's frame at the start
+        turn[:2, :2] = rotation(start[2])
+        held = turn @ np.diag(1.0 / LINE_HELD) @ turn.T
+        for reach in reaches:
+            hessian, gradient, *_ = self._system(pose, reach)
+            pose = pose - np.linalg.solve(hessian + held, gradient + held @ (pose - start))
+        hessian, _, matched, square = self._system(pose, reaches[-1])
+        if matched.sum() < self.limits.fewest:
+            return pose, np.zeros((3, 3)), matched, square
+        covariance = np.linalg.inv(hessian + held) + turn @ np.diag(LINES_ALIKE) @ turn.T
+        return pose, np.asarray(np.linalg.inv(covariance)), matched, square
 
+    def squares(self, pose: Array, reach: float) -> tuple[Array, BoolArray]:
+        """Whitened squares (m,) of the detections at a pose (3,), and which of them are matched."""
+        targets, _, squares = self._misfit(pose, reach)
+        return squares, targets.matched
 
-def squares_at(
-    recent: tuple[Array, Array],
-    seen: tuple[Array, Array, BoolArray],
-    pose: Array,
-    reach: float,
-    limits: Limits,
-) -> tuple[Array, BoolArray]:
-    """Return the whitened squares (m,) of detections at a pose (3,), and which of them are matched."""
-    targets, _, squares = _misfit(recent, seen, pose, reach, limits)
-    return squares, targets.matched
+    def _targets(self, pose: Array, reach: float) -> Targets:
+        is_line, limits = self.seen.is_line, self.limits
+        placed = to_map(self.seen.points, pose[None])
+        found = Targets(
+            np.zeros(placed.shape), np.ones(len(placed)), np.zeros(placed.shape), np.zeros(len(placed), bool)
+        )
+        if len(self.cones) and not is_line.all():
+            alone = placed[~is_line]
+            means, weights = kernels.weighted_means(alone, self.cones, reach, limits.farthest)
+            found.off[~is_line], found.weights[~is_line] = alone - means, weights
+            found.matched[~is_line] = np.asarray(weights) > limits.weight
+        if len(self.lines) and is_line.any():
+            own = targets_on_lines(placed[is_line], self.lines, LINE_REACH * reach, limits.farthest)
+            for column, values in zip(found, own, strict=True):
+                column[is_line] = values
+        return found
 
+    def _misfit(self, pose: Array, reach: float) -> tuple[Targets, Array, Array]:
+        """Targets at a pose (3,), and variances and whitened squares (m,) of the detections."""
+        targets = self._targets(pose, reach)
+        weights = np.where(targets.matched, targets.weights, 1.0)
+        variances = self.seen.variances * (1.0 + 1.0 / weights) + self.limits.sigma**2
+        is_line = targets.normals.any(axis=1)
+        across = (targets.off * targets.normals).sum(axis=1) ** 2
+        squares = np.where(is_line, across, (targets.off**2).sum(axis=1)) / variances
+        return targets, np.asarray(variances), np.asarray(squares)
 
-def _targets(
-    recent: tuple[Array, Array],
-    seen: tuple[Array, Array, BoolArray],
-    pose: Array,
-    reach: float,
-    limits: Limits,
-) -> Targets:
-    points, _, is_line = seen
-    placed = to_map(points, pose[None])
-    found = Targets(
-        np.zeros(placed.shape), np.ones(len(placed)), np.zeros(placed.shape), np.zeros(len(placed), bool)
-    )
-    if len(recent[0]) and not is_line.all():
-        own = targets_on_cones(placed[~is_line], recent[0], reach, limits)
-        for column, values in zip(found, own, strict=True):
-            column[~is_line] = values
-    if len(recent[1]) and is_line.any():
-        own = targets_on_lines(placed[is_line], recent[1], LINE_REACH * reach, limits.farthest)
-        for column, values in zip(found, own, strict=True):
-            column[is_line] = values
-    return found
-
-
-def _misfit(
-    recent: tuple[Array, Array],
-    seen: tuple[Array, Array, BoolArray],
-    pose: Array,
-    reach: float,
-    limits: Limits,
-) -> tuple[Targets, Array, Array]:
-    """Return what detections are drawn to at a pose (3,), and variances and whitened squares (m,)."""
-    targets = _targets(recent, seen, pose, reach, limits)
-    weights = np.where(targets.matched, targets.weights, 1.0)
-    variances = seen[1] * (1.0 + 1.0 / weights) + limits.sigma**2
-    is_line = targets.normals.any(axis=1)
-    across = (targets.off * targets.normals).sum(axis=1) ** 2
-    squares = np.where(is_line, across, (targets.off**2).sum(axis=1)) / variances
-    return targets, np.asarray(variances), np.asarray(squares)
-
-
-def _system(
-    recent: tuple[Array, Array],
-    seen: tuple[Array, Array, BoolArray],
-    pose: Array,
-    reach: float,
-    limits: Limits,
-) -> tuple[Array, Array, BoolArray, float]:
-    """Return Hessian (3, 3) and gradient (3,) of half the sum of squares, which are matched, and the sum."""
-    targets, variances, square = _misfit(recent, seen, pose, reach, limits)
-    weights = huber_weights(np.sqrt(square), limits.huber) * targets.matched / variances
-    n, is_line = targets.normals, targets.normals.any(axis=1)
-    axes = np.where(np.asarray(is_line)[:, None, None], n[:, :, None] * n[:, None, :], np.eye(2))
-    information = axes * weights[:, None, None]
-    arm = left_of(to_map(seen[0], pose[None]) - pose[:2])
-    jacobian = np.concatenate([np.tile(np.eye(2), (len(arm), 1, 1)), arm[:, :, None]], axis=2)
-    weighted = information @ jacobian
-    hessian = np.einsum("mij,mik->jk", jacobian, weighted)
-    gradient = np.einsum("mij,mi->j", weighted, targets.off)
-    return hessian, gradient, targets.matched, float(np.where(targets.matched, square, 0.0).sum())
+    def _system(self, pose: Array, reach: float) -> tuple[Array, Array, BoolArray, float]:
+        """Hessian (3, 3) and gradient (3,) of half the sum of squares, which are matched, and the sum."""
+        targets, variances, square = self._misfit(pose, reach)
+        weights = huber_weights(np.sqrt(square), self.limits.huber) * targets.matched / variances
+        n, is_line = targets.normals, targets.normals.any(axis=1)
+        axes = np.where(np.asarray(is_line)[:, None, None], n[:, :, None] * n[:, None, :], np.eye(2))
+        information = axes * weights[:, None, None]
+        arm = left_of(to_map(self.seen.points, pose[None]) - pose[:2])
+        jacobian = np.concatenate([np.tile(np.eye(2), (len(arm), 1, 1)), arm[:, :, None]], axis=2)
+        weighted = information @ jacobian
+        hessian = np.einsum("mij,mik->jk", jacobian, weighted)
+        gradient = np.einsum("mij,mi->j", weighted, targets.off)
+        return hessian, gradient, targets.matched, float(np.where(targets.matched, square, 0.0).sum())

@@ -37,7 +37,7 @@ from .measurement import (
 )
 from .sightings import FOLLOW_RANGE, MAX_AGE, MIN_SPEED_SHARE, SeenCycle, Sightings, TwistRecord, by_bias
 
-CELL: Final = 2.0  # side of the cells (m) inside of which a line is a parabola
+CELL: Final = 4.0  # side of the cells (m) in which a line is a parabola; small ones cut off large errors
 MOST_POINTS: Final = 4000  # points that are measured on, which bounds the time of a round
 FEWEST: Final = 8  # points of a line in a cell
 SHAPE: Final = np.array([0.0, 0.25, 10.0])
@@ -66,7 +66,7 @@ class Fit:
 
 
 def points_of(cycles: Sequence[SeenCycle]) -> Sightings:
-    """Return the points of lines that were seen in motion, in order of time, in no cell yet."""
+    """Points of lines that were seen in motion, in order of time, with their labels for cells."""
     t, twists = np.array([one.detections.t for one in cycles]), np.array([one.twist for one in cycles])
     poses = np.array([one.pose for one in cycles])
     derivatives, speed = by_bias(t, poses), np.hypot(twists[:, 0], twists[:, 1])
@@ -76,8 +76,8 @@ def points_of(cycles: Sequence[SeenCycle]) -> Sightings:
     rows = np.flatnonzero(moving & (np.hypot(*points.T) < FOLLOW_RANGE))
     rows = rows[:: max(-(-len(rows) // MOST_POINTS), 1)]
     own = cycle[rows]
-    none = np.zeros(len(rows), np.intp)
-    return Sightings(none, t[own], points[rows], twists[own], poses[own], derivatives[own])
+    labels = np.concatenate([np.zeros(0, np.intp), *(one.detections.labels for one in cycles)])[rows]
+    return Sightings(labels, t[own], points[rows], twists[own], poses[own], derivatives[own])
 
 
 def in_cells(table: Sightings, errors: Array) -> tuple[Sightings, IntArray, IntArray]:
@@ -87,7 +87,8 @@ def in_cells(table: Sightings, errors: Array) -> tuple[Sightings, IntArray, IntA
     """
     at = np.arange(len(table.t), dtype=np.intp)
     cell = np.floor((to_map(table.point, table.pose) + _columns(table, at) @ errors) / CELL)
-    order = np.lexsort((table.t, cell[:, 1], cell[:, 0]))
+    cell = np.column_stack([cell, table.cone])
+    order = np.lexsort((table.t, *cell.T))
     cell, t = cell[order], table.t[order]
     new = (np.diff(cell, axis=0, prepend=np.nan) != 0.0).any(axis=1) | (np.diff(t, prepend=-np.inf) > MAX_AGE)
     number = np.cumsum(new) - 1

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib import import_module
 from math import inf
 from typing import Any, Final, Literal
 
@@ -47,6 +48,8 @@ class NoiseLearner(Copyable):
         self._cycles: tuple[SeenCycle, ...] = ()  # newest cycles
         self._twists = TwistRecord()
         self._of_lines = of_lines
+        if of_lines:
+            import_module("scipy.optimize")  # 50 ms, which no cycle has to spare
         self._measurement: Measurement | LineMeasurement | None = None
         self._driven, self._due = 0.0, FIRST
         self._t: float | None = None

@@ -9,7 +9,7 @@ Detections with a latency tau lie `tau v` too far ahead, which is observable whe
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -23,7 +23,7 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
 
-from .line_matching import HEADING_TOLD, Limits, match_lines, squares_at
+from .line_matching import HEADING_TOLD, Limits, LineMatch, Seen
 
 LEARNED_ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
 SIGMAS_ERRORS: Final = (0.02, 0.05)  # rad and s, first: those of a hasty mounting
@@ -32,6 +32,7 @@ MINUTE: Final = 60.0
 
 SCAN_MEMORY: Final = 0.65  # age of remembered detections, s, over which odometry hardly drifts
 MOST_REMEMBERED: Final = 2000  # largest number of remembered detections, which bounds the time of a match
+LINE_REMEMBERED: Final = 40  # largest number of points of lines in a remembered cycle
 REACH_FIRST: Final = 1.0
 REACH_LAST: Final = 0.4
 """Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
@@ -53,17 +54,6 @@ MISFIT_GAIN: Final = 0.02  # smoothing gain of the mean-square misfit
 MAX_MISFIT: Final = 3.0  # largest misfit of a motion: 1 where the vehicle moved, 4 where it was put down
 MISFIT_ODOMETRY: Final = 2.0  # least misfit at the odometry's own pose in a contradiction
 MISFIT_RATIO: Final = 1.3  # least ratio of that misfit to the one of the match
-
-
-class Seen(NamedTuple):
-    """Detections of a cycle, prepared for a match."""
-
-    points: Array  # (m, 2) corrected, vehicle frame (m)
-    variances: Array  # (m,) variance of one coordinate (m^2)
-    is_line: BoolArray  # (m,) whether they are points of a line
-
-    def where(self, chosen: BoolArray) -> "Seen":
-        return Seen(self.points[chosen], self.variances[chosen], self.is_line[chosen])
 
 
 _TINY: Final = float(np.finfo(float).tiny)
@@ -155,22 +145,6 @@ def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array,
 
 
 MATCH_LIMITS: Final = Limits(FARTHEST, MIN_WEIGHT, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED)
-
-
-def match_with_lines(
-    recent: RecentDetections, lines: RecentDetections, seen: Seen, start: Array, reaches: Sequence[float]
-) -> Match:
-    """Register detections of cones and of lines to recent ones, from an initial pose (3,)."""
-    points = recent.points, lines.points
-    pose, information, matched, square = match_lines(points, seen, start, reaches, MATCH_LIMITS)
-    return Match(pose, information, matched, square / max(int(matched.sum()), 1), by_lines=True)
-
-
-def misfit_with_lines(recent: RecentDetections, lines: RecentDetections, seen: Seen, pose: Array) -> float:
-    """Return the mean square of the whitened distances of `match_with_lines` at a given pose (3,)."""
-    square, matched = squares_at((recent.points, lines.points), seen, pose, REACH_LAST, MATCH_LIMITS)
-    square = np.where(matched, square, MOST_MISFIT)
-    return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
 
 
 # --- errors of the sensor --------------------------------------------------------------------------------
@@ -287,10 +261,11 @@ class ScanMatcher(Copyable):
     def remember(self, detections: Detections, twist: Array, pose: Array, is_line: BoolArray) -> None:
         """Remember the detections of a cycle with a pose (3,) and a twist (3,)."""
         measured = detections.points_vehicle
-        columns = by_errors(measured, twist)
-        for recent, chosen in ((self.recent, ~is_line), (self.recent_lines, is_line)):
-            if chosen.any():
-                recent.add(detections.t, measured[chosen], columns[chosen], pose)
+        columns, lines = by_errors(measured, twist), np.flatnonzero(is_line)
+        lines = lines[:: max(-(-len(lines) // LINE_REMEMBERED), 1)]
+        for recent, rows in ((self.recent, np.flatnonzero(~is_line)), (self.recent_lines, lines)):
+            if len(rows):
+                recent.add(detections.t, measured[rows], columns[rows], pose)
 
     def has(self, seen: Seen, pose: Array) -> BoolArray:
         """Whether each detection (m,), seen from a pose (3,), coincides with earlier ones."""
@@ -304,7 +279,9 @@ class ScanMatcher(Copyable):
     def match(self, seen: Seen, start: Array, reaches: Sequence[float]) -> Match | None:
         """Return the match of detections from an initial pose (3,); None if the pose is not observable."""
         if seen.is_line.any():
-            matched = match_with_lines(self.recent, self.recent_lines, seen, start, reaches)
+            pose, information, chosen, square = self._beside(seen).found(start, reaches)
+            misfit = square / max(int(chosen.sum()), 1)
+            matched = Match(pose, information, chosen, misfit, by_lines=True)
         else:
             matched = match(self.recent, seen.points, seen.variances, start, reaches)
         return matched if matched.matched >= MIN_MATCHED and matched.is_certain else None
@@ -332,10 +309,19 @@ class ScanMatcher(Copyable):
     def fits_better(self, matched: Match, predicted: Array, seen: Seen) -> bool:
         """Whether detections fit badly at the predicted pose (3,), and clearly better at the match."""
         chosen = seen.where(matched.is_matched)
+        poses = predicted, matched.pose
         at_odometry, at_match = (
-            misfit_with_lines(self.recent, self.recent_lines, chosen, pose)
+            [self._misfit_with_lines(chosen, pose) for pose in poses]
             if matched.by_lines
-            else misfit_at(self.recent, chosen.points, chosen.variances, pose)
-            for pose in (predicted, matched.pose)
+            else [misfit_at(self.recent, chosen.points, chosen.variances, pose) for pose in poses]
         )
         return at_odometry > max(MISFIT_ODOMETRY, MISFIT_RATIO * at_match)
+
+    def _misfit_with_lines(self, seen: Seen, pose: Array) -> float:
+        """Mean square of the whitened distances at a pose (3,), as `misfit_at` has it for cones."""
+        square, matched = self._beside(seen).squares(pose, REACH_LAST)
+        square = np.where(matched, square, MOST_MISFIT)
+        return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
+
+    def _beside(self, seen: Seen) -> LineMatch:
+        return LineMatch(self.recent.points, self.recent_lines.points, seen, MATCH_LIMITS)

@@ -2,13 +2,13 @@
 
 import json
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import count, pairwise
 from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree as ET
 
 import numpy as np
+import pymap3d
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
@@ -73,10 +73,6 @@ def sampled(spline: BSpline, step: float, fewest: int = _FEWEST_INTERVALS) -> Ar
 
 # --- latitude and longitude ------------------------------------------------------------------------------
 
-SEMI_MAJOR_AXIS: Final = 6_378_137.0  # radius of the equator of WGS84 (m)
-FLATTENING: Final = 1.0 / 298.257223563  # flattening of the ellipsoid of WGS84
-_SQUARE: Final = FLATTENING * (2.0 - FLATTENING)  # square e^2 of its eccentricity
-_ITERATIONS: Final = 8  # iterations of the latitude, each of which leaves less than a hundredth of the error
 _DECIMALS_DEGREES: Final = 10  # number of decimals of degrees, which is 0.01 mm
 
 
@@ -104,31 +100,10 @@ class LocalPlane:
 
     def to_geodetic(self, points_map: Array) -> Array:
         """Return latitude and longitude (n, 2), in degrees, of points (n, 2) of the map in m."""
-        origin, axes = self._frame
-        x, y, z = (origin + points_map @ axes).T
-        across = np.hypot(x, y)
-        latitude = np.arctan2(z, across * (1.0 - _SQUARE))
-        for _ in range(_ITERATIONS):
-            sine = np.sin(latitude)
-            latitude = np.arctan2(z + _SQUARE * _normal_radius(sine) * sine, across)
-        return np.asarray(np.degrees(np.column_stack([latitude, np.arctan2(y, x)])))
-
-    @cached_property
-    def _frame(self) -> tuple[Array, Array]:
-        """Return the origin (3,) in m and the axes x and y (2, 3), in the frame fixed to the earth."""
-        latitude, longitude, heading = np.radians([self.latitude, self.longitude, self.heading])
-        sine, cosine = np.sin(latitude), np.cos(latitude)
-        east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
-        up = np.array([*(cosine * np.array([np.cos(longitude), np.sin(longitude)])), sine])
-        forward = np.sin(heading) * east + np.cos(heading) * np.cross(up, east)
-        normal = _normal_radius(sine)
-        origin = normal * np.append(up[:2], (1.0 - _SQUARE) * sine)
-        return origin, np.stack([forward, np.cross(up, forward)])
-
-
-def _normal_radius(sine: Any) -> Any:
-    """Return the radius of curvature N across the meridian, in m, at the sine of a latitude."""
-    return SEMI_MAJOR_AXIS / np.sqrt(1.0 - _SQUARE * sine**2)
+        sine, cosine = np.sin(np.radians(self.heading)), np.cos(np.radians(self.heading))
+        east, north = (points_map @ np.array([[sine, cosine], [-cosine, sine]])).T
+        degrees = pymap3d.enu2geodetic(east, north, 0.0 * east, self.latitude, self.longitude, 0.0)
+        return np.column_stack(degrees[:2])
 
 
 # --- GeoJSON ---------------------------------------------------------------------------------------------

@@ -1,10 +1,5 @@
-"""Output that appears as a whole or not at all, and never costs an earlier result.
+"""Output that appears as a whole or not at all, and never costs an earlier result."""
 
-Audit hooks (`sys.addaudithook`) see each step that changes what a path names, and can end the process before.
-"""
-
-import ctypes
-import errno
 import json
 import math
 import os
@@ -14,7 +9,6 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
-from functools import cache
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,14 +26,6 @@ except ImportError:  # Windows has no such locks
     fcntl = None  # type: ignore[assignment]
 
 STDOUT: Final = Path("-")  # path at which a single file is written to standard output
-SYNC: Final = "pathspace_graph.sync"  # audit event before a file or a folder is flushed, with its path
-RENAME: Final = "pathspace_graph.rename"  # audit event before a rename with flags, with both paths
-
-_AT_FDCWD: Final = -100  # a relative path is relative to the working folder
-_NOREPLACE: Final = 1
-_EXCHANGE: Final = 2
-_UNSUPPORTED: Final = frozenset({errno.ENOSYS, errno.EINVAL, errno.ENOTSUP})
-_TOKEN: Final = "[0-9a-f]{8}"
 
 
 @contextmanager
@@ -47,12 +33,24 @@ def atomic_folder(target: Path | str, marker: str) -> Iterator[Path]:
     """Yield a temporary folder beside `target` that gets a manifest and takes its place on success.
 
     An earlier result, known by the file `marker`, is kept as a numbered backup `NAME.~1~`; anything else but
-    an empty folder is an OutputError. Even where the power is cut, the target is the old or the new.
+    an empty folder is an OutputError.
     """
     final = _followed(target)
-    with _placed(final, Path.mkdir, lambda: check_target(final, marker)) as temporary:
+    check_target(final, marker)
+    with _parents(final), _beside(final, Path.mkdir) as temporary:
         yield temporary
         (temporary / MANIFEST_FILE).write_text(manifest_of(temporary), encoding="utf-8", newline="\n")
+        check_target(final, marker)
+        for path in (*temporary.rglob("*"), temporary):
+            _sync(path)
+        backup = _backup(final)
+        try:
+            temporary.rename(final)
+        except OSError:
+            if backup:
+                backup.rename(final)
+            raise
+        _sync(final.parent)
 
 
 @contextmanager
@@ -73,7 +71,8 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
                     stream.write(content)
                     stream.flush()
         return
-    with _placed(final, Path.touch, lambda: check_file_target(final)) as temporary:
+    check_file_target(final)
+    with replacing(final, backup=True) as temporary:
         yield temporary
 
 
@@ -83,14 +82,16 @@ def is_stream(path: Path) -> bool:
 
 
 @contextmanager
-def replacing(file: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `file` that takes its place on success; no backup is kept."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with _naming(file), _beside(file, Path.touch) as temporary:
+def replacing(file: Path, *, backup: bool = False) -> Iterator[Path]:
+    """Yield a temporary path beside `file` that takes its place on success."""
+    with _parents(file), _beside(file, Path.touch) as temporary:
         yield temporary
-        sync(temporary)
+        _sync(temporary)
+        if backup:
+            check_file_target(file)
+            _backup(file)
         temporary.replace(file)
-        sync(file.parent)
+        _sync(file.parent)
 
 
 def write_text(file: Path, text: str) -> None:
@@ -123,6 +124,9 @@ def write_manifest(folder: Path) -> None:
 
 def remove_manifest(folder: Path) -> None:
     (folder / MANIFEST_FILE).unlink(missing_ok=True)
+
+
+# --- what is there -------------------------------------------------------------------------------------
 
 
 def check_target(target: Path | str, marker: str) -> None:
@@ -166,48 +170,41 @@ def _check_parents(target: Path) -> None:
         raise OutputError(f"{nearest}: expected a folder that can be written")
 
 
-# --- the way to the place ----------------------------------------------------------------------------------
+def _backup(final: Path) -> Path | None:
+    """Give what is at a path a numbered name: a folder has only that one then, a file has both."""
+    with suppress(OSError):
+        final.rmdir()  # an empty folder is no result
+    if not os.path.lexists(final):
+        return None
+    names = (final.with_name(f"{final.name}.~{number}~") for number in count(1))
+    backup = next(name for name in names if not os.path.lexists(name))
+    if final.is_dir():
+        return final.rename(backup)
+    try:
+        os.link(final, backup, follow_symlinks=False)
+    except OSError:  # a file system without hard links
+        shutil.copy2(final, backup, follow_symlinks=False)
+    return backup
+
+
+# --- the way to the place ------------------------------------------------------------------------------
 
 
 @contextmanager
-def _placed(final: Path, make: Callable[[Path], None], check: Callable[[], None]) -> Iterator[Path]:
-    """Yield a temporary path that is put in place on success; on failure new folders above are removed."""
-    check()
+def _parents(final: Path) -> Iterator[None]:
+    """Make the folders above a path, which go again on failure; errors of the disk name the path."""
     missing = [parent for parent in final.parents if not parent.exists()]
     with _naming(final):
         try:
             final.parent.mkdir(parents=True, exist_ok=True)
-            with _beside(final, make) as temporary:
-                yield temporary
-                check()
-                sync_tree(temporary)
-                _put_in_place(temporary, final)
-            for parent in (final, *missing):
-                sync(parent.parent)
+            yield
         except BaseException:
             for parent in missing:
                 with suppress(OSError):
                     parent.rmdir()
             raise
-
-
-def _put_in_place(temporary: Path, final: Path) -> None:
-    if temporary.is_dir():
-        with suppress(OSError):
-            temporary.rename(final)  # also over an empty folder, but over nothing else
-            return
-    numbers = count(1)
-    while not rename_new(temporary, final):
-        backup = final.with_name(f"{final.name}.~{next(numbers)}~")
-        if rename_new(temporary, backup):
-            try:
-                exchange(backup, final, spare=temporary)
-                return
-            except OSError as error:
-                with suppress(FileNotFoundError):
-                    backup.rename(temporary)
-                if not isinstance(error, FileNotFoundError):  # what is there may go meanwhile
-                    raise
+        for parent in missing:
+            _sync(parent.parent)
 
 
 @contextmanager
@@ -224,134 +221,60 @@ def _naming(final: Path) -> Iterator[None]:
         raise OutputError(f"{final}: can't be written: {error.strerror or error}") from error
 
 
-# --- temporary paths -------------------------------------------------------------------------------------
-
-
 def is_temporary(name: str) -> bool:
-    return re.fullmatch(rf"\..*\.{_TOKEN}\.tmp(\.[^.]*)?", name) is not None
+    return re.fullmatch(r"\..*\.[0-9a-f]{8}\.tmp(\.[^.]*)?", name) is not None
 
 
 @contextmanager
 def _beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
-    """Yield a new path beside `final`, made by `make` and locked, which is gone at the end."""
-    remove_leftovers(final)
-    descriptor = None
-    while descriptor is None:
-        # the suffix stays last, as writers choose the format by it
-        path = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.tmp{final.suffix}")
-        make(path)
-        descriptor = lock(path, wait=True)
-        if descriptor is None and path.exists():  # no locks here
-            break
+    """Yield a new path beside `final`, made by `make` and locked, which is gone at the end.
+
+    Those that dead runs left there go as well: nobody has locked them.
+    """
+    stem, suffix = re.escape(f".{final.stem}."), re.escape(f".tmp{final.suffix}")
+    for path in final.parent.iterdir():
+        if fcntl and re.fullmatch(f"{stem}[0-9a-f]{{8}}{suffix}", path.name):
+            with suppress(OSError), _locked(path):
+                _remove(path)
+    # the suffix stays last, as writers choose the format by it
+    path = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.tmp{final.suffix}")
+    make(path)
+    with _locked(path):
+        try:
+            yield path
+        finally:
+            _remove(path)
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Lock a path, or raise an OSError where another living process has; the kernel ends a dead one's."""
+    if fcntl is None:
+        yield
+        return
+    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     try:
-        yield path
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
     finally:
-        _remove(path)
-        if descriptor is not None:
-            os.close(descriptor)
-
-
-def remove_leftovers(final: Path) -> None:
-    """Remove the temporary files of `final` that no living process has locked."""
-    name = re.compile(re.escape(f".{final.stem}.") + _TOKEN + re.escape(f".tmp{final.suffix}"))
-    with suppress(OSError):
-        for leftover in [path for path in final.parent.iterdir() if name.fullmatch(path.name)]:
-            descriptor = lock(leftover, wait=False)
-            if descriptor is not None:
-                _remove(leftover)
-                os.close(descriptor)
+        os.close(descriptor)
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
+    if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
     with suppress(OSError):
         path.unlink(missing_ok=True)
 
 
-def lock(path: Path, *, wait: bool) -> int | None:
-    """Return a descriptor that locks a path until it is closed or the process dies; None without a lock."""
-    if fcntl is None:
-        return None
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
-    except OSError:
-        return None
-    with suppress(OSError):
-        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        if os.path.samestat(os.fstat(descriptor), path.lstat()):
-            return descriptor
-    os.close(descriptor)
-    return None
-
-
-# --- single steps ----------------------------------------------------------------------------------------
-
-
-def sync(path: Path) -> None:
+def _sync(path: Path) -> None:
     """Wait until the content of a file, or the names in a folder, are on the disk."""
-    sys.audit(SYNC, str(path))
     try:
         descriptor = os.open(path, os.O_RDONLY)
-    except PermissionError:  # what may be written need not be readable
-        return
-    try:
-        os.fsync(descriptor)
-    except OSError as error:
-        if error.errno not in _UNSUPPORTED:  # some file systems can't flush a folder
-            raise
-    finally:
-        os.close(descriptor)
-
-
-def sync_tree(path: Path) -> None:
-    """Wait until a file, or a folder with everything below it, is on the disk."""
-    for inner in (*sorted(path.rglob("*"), reverse=True), path):
-        if not inner.is_symlink():
-            sync(inner)
-
-
-def rename_new(source: Path, target: Path) -> bool:
-    """Rename to a path that names nothing; return False, and do nothing, where something is there."""
-    try:
-        if _rename(source, target, _NOREPLACE):
-            return True
-    except FileExistsError:
-        return False
-    if os.path.lexists(target):
-        return False
-    source.rename(target)
-    return True
-
-
-def exchange(first: Path, second: Path, spare: Path) -> None:
-    """Exchange what two paths name: in one step, or else in three by way of `spare`."""
-    if _rename(first, second, _EXCHANGE):
-        return
-    first.rename(spare)
-    second.rename(first)
-    try:
-        spare.rename(second)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
     except OSError:
-        first.rename(second)
-        raise
-
-
-@cache
-def _renameat2() -> Any:
-    """Return the rename with flags of Linux; None elsewhere."""
-    return getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if sys.platform == "linux" else None
-
-
-def _rename(source: Path, target: Path, flag: int) -> bool:
-    """Rename with a flag; return False where the system or the file system does not know the flag."""
-    sys.audit(RENAME, str(source), str(target))
-    rename = _renameat2()
-    if rename is None:
-        return False
-    if rename(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), flag) == 0:
-        return True
-    code = ctypes.get_errno()
-    if code in _UNSUPPORTED:
-        return False
-    raise OSError(code, os.strerror(code), str(source), None, str(target))
+        if not path.is_dir():  # some systems can't flush a folder
+            raise

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
-from pathspace_graph.labels import KINDS, NAMES, Kind, label_from_name
+from pathspace_graph.labels import KINDS, NAMES, UNKNOWN, Kind, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS
 
 from . import parsing as limits
@@ -34,6 +35,7 @@ TRUTH_ASSOCIATIONS_FILE: Final = "truth_associations.csv"
 
 _STAMP: Final = {"t": Column(limits.MAX_STAMP, "s")}
 _POINT: Final = {"x": Column(unit="m"), "y": Column(unit="m")}
+_LABEL: Final = Column(len(NAMES) - 1, read=label_from_name)
 _SPEED: Final = Column(limits.MAX_SPEED, "m/s")
 _RANGE: Final = Column(limits.MAX_RANGE, "m")
 _COVARIANCE: Final = Column(limits.MAX_RANGE**2, "m^2")
@@ -41,11 +43,11 @@ COLUMNS: Final[dict[str, dict[str, Column]]] = {  # of each table, in the order 
     ODOMETRY_FILE: {**_STAMP, "vx": _SPEED, "vy": _SPEED, "wz": Column(limits.MAX_YAW_RATE, "rad/s")},
     DETECTIONS_FILE: {
         **_STAMP,
-        **{"x": _RANGE, "y": _RANGE, "label": Column()},
+        **{"x": _RANGE, "y": _RANGE, "label": _LABEL},
         **dict.fromkeys(("xx", "xy", "yy"), _COVARIANCE),
     },
     TRUTH_POSES_FILE: {**_STAMP, **_POINT, "theta": Column(limits.MAX_ANGLE, "rad")},
-    TRUTH_CONES_FILE: {**_POINT, "label": Column()},
+    TRUTH_CONES_FILE: {**_POINT, "label": _LABEL},
     TRUTH_ASSOCIATIONS_FILE: {"cone": Column()},
 }
 TRUTH_FILES: Final = (TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FILE)  # which are optional
@@ -218,6 +220,41 @@ class Log:
         figure: Figure = pictures().plot_log(self, **options)
         return figure
 
+    @classmethod
+    def from_arrays(
+        cls,
+        t: ArrayLike,
+        twist: ArrayLike,
+        detection_t: ArrayLike,
+        points: ArrayLike,
+        *,
+        labels: Iterable[int | str] | None = None,
+        covariances: ArrayLike | None = None,
+        odometry_sigma: ArrayLike | None = None,
+        kind: Kind | None = None,
+    ) -> Log:
+        """Return the log of body twists (N, 3) at t (N,) and of points (m, 2) detected at detection_t (m,).
+
+        Units are s, m and rad, points are in the vehicle frame, and each twist is held until the next.
+        Detections of one stamp are one cycle. A label is a number or a word, by default unknown.
+        Noise that is not given, covariances (m, 2, 2) or sigmas (3,) of a twist, is measured when the log is
+        mapped. An InputError names the argument and the row, from 1.
+        """
+        points, (m, s) = np.asarray(points, float).reshape(-1, 2), (covariances, odometry_sigma)
+        K = np.asarray(ray_covariances(points, SIGMA_DETECTIONS) if m is None else m, float).reshape(-1, 4)
+        words = [label_from_name(one) if isinstance(one, str) else one for one in labels or ()]
+        labelled = words if labels is not None else np.full(len(points), UNKNOWN)
+        odometry = _read_odometry(_as_table(ODOMETRY_FILE, t, twist))
+        found = _as_table(DETECTIONS_FILE, detection_t, points, labelled, K[:, [0, 1, 3]])
+        return cls(
+            odometry,
+            _cycles(found, float(odometry.t[0]), float(odometry.t[-1])),
+            np.array(SIGMA_ODOMETRY if s is None else s, float),
+            SensorInfo(kind=kind),
+            odometry_stated=s is not None,
+            detections_stated=m is not None,
+        )
+
     @property
     def noise(self) -> KnownNoise:
         return KnownNoise(self.odometry_sigma, self.odometry_stated, self.detections_stated, self.measured)
@@ -256,8 +293,22 @@ def _read_sensor(header: Header) -> SensorInfo:
 def _table(folder: Path, name: str) -> Table:
     """Return a table of a log; one of the truth that is not known has no rows."""
     if name in TRUTH_FILES and not (folder / name).exists():
-        return Table(folder / name, {column: [] for column in COLUMNS[name]}, [])
+        return Table(
+            folder / name, dict.fromkeys(COLUMNS[name], np.zeros(0)), np.zeros(0, int), COLUMNS[name]
+        )
     return read_table(folder / name, COLUMNS[name])
+
+
+def _as_table(name: str, *values: ArrayLike) -> Table:
+    """Return arrays (rows,) and (rows, k) as the table that is read from a file with their columns."""
+    file, columns = Path(name).with_suffix(""), COLUMNS[name]
+    try:
+        rows = np.column_stack([np.asarray(value, float) for value in values])
+    except ValueError as error:
+        raise InputError(file, f"expected arrays of numbers with a row each: {error}") from None
+    if rows.shape[1] != len(columns):
+        raise InputError(file, f"expected the columns {', '.join(columns)}, found {rows.shape[1]}")
+    return Table(file, dict(zip(columns, rows.T, strict=True)), np.arange(len(rows)) + 1, columns)
 
 
 def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
@@ -367,7 +418,7 @@ def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:
 
 
 def labels_of(table: Table) -> IntArray:
-    return np.array([label_from_name(name) for name in table.columns["label"]], dtype=int)
+    return table.numbers("label").astype(int)
 
 
 def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) -> Truth | None:

@@ -6,19 +6,20 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 import numpy as np
+from msgspec import Meta, Struct
 from scipy.linalg import block_diag
 
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.labels import BOUNDARIES, LABELS, LEFT, NAMES, POINTS, RIGHT
+from pathspace_graph.labels import BOUNDARIES, LABELS, LEFT, NAMES, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
 from .brief import Brief, pictures
-from .parsing import MAX_COORDINATE, MAX_DEGREE, MAX_INTEGER, read_json, shown
+from .parsing import MAX_COORDINATE, MAX_DEGREE, read_json, shown, typed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -218,138 +219,108 @@ def _boundary_to_json(boundary: MapBoundary) -> dict[str, Any]:
     }
 
 
+Coordinate = Annotated[float, Meta(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]  # finite: a NaN is refused too
+Point = tuple[Coordinate, Coordinate]
+Matrix = list[list[Annotated[float, Meta(ge=-(MAX_COORDINATE**2), le=MAX_COORDINATE**2)]]]
+
+
+class _Points(Struct):
+    """Points as they stand in a file."""
+
+    points: list[Point]
+    covariance: Matrix
+    size: int
+
+
+class _Curve(Struct):
+    """A curve as it stands in a file."""
+
+    degree: Annotated[int, Meta(ge=1, le=MAX_DEGREE)]
+    periodic: bool
+    knots: list[Coordinate]
+    control_points: list[Point]
+    covariance: Matrix
+    size: int
+    confirmed_until: Coordinate = math.inf
+    cones: list[Point] = []
+
+
+class _File(Struct):
+    """The content of `map.json`."""
+
+    closed: bool
+    boundaries: dict[Annotated[str, Meta(pattern="^(left|right)$")], Any]
+    cross_covariance: Matrix | None = None
+    points: dict[Annotated[str, Meta(pattern="^(orange|big_orange)$")], _Points] = {}
+
+
 def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:
     """Return the map of a `map.json`'s content; an InputError names `file` and what breaks FORMATS."""
-    top = _Object(Path(file), "", content)
-    if top.entries.get("format") != FORMAT:
-        raise InputError(top.file, f'expected format = "{FORMAT}", found {shown(top.entries.get("format"))}')
-    boundaries, names = top.object("boundaries"), {NAMES[label]: label for label in BOUNDARIES}
-    unknown = sorted(boundaries.entries.keys() - names)
-    if unknown:
-        raise boundaries.error("", f"expected left and right, found {shown(unknown[0])}")
-    closed = top.boolean("closed")
-    mapped = {names[name]: _boundary(boundaries.object(name)) for name in names if name in boundaries.entries}
-    joint = _joint_covariance(top, mapped) if "cross_covariance" in top.entries else None
-    return Map(closed, mapped, joint, _points(top) if "points" in top.entries else {})
+    file = Path(file)
+    stated = typed(content, dict[str, Any], file).get("format")
+    if stated != FORMAT:
+        raise InputError(file, f'expected format = "{FORMAT}", found {shown(stated)}')
+    top = typed(content, _File, file)
+    boundaries: dict[int, MapBoundary] = {}
+    for name, entry in sorted(top.boundaries.items()):
+        where = f"boundaries.{name}"
+        if isinstance(entry, dict) and "points" in entry:
+            boundaries[LABELS[name]] = _points(typed(entry, _Points, file, where), file, where)
+        else:
+            boundaries[LABELS[name]] = _curve(typed(entry, _Curve, file, where), file, where)
+    points = {LABELS[name]: _points(cones, file, f"points.{name}") for name, cones in top.points.items()}
+    joint = None if top.cross_covariance is None else _joint(top.cross_covariance, boundaries, file)
+    return Map(top.closed, boundaries, joint, points)
 
 
-def _boundary(entry: _Object) -> MapBoundary:
-    if "points" in entry.entries:
-        points = entry.array("points", columns=2)
-        return PointBoundary(points, _covariance(entry, len(points)))
-    degree, periodic = entry.integer("degree", 1, MAX_DEGREE), entry.boolean("periodic")
+def _points(read: _Points, file: Path, where: str) -> PointBoundary:
+    return PointBoundary(_rows(read.points), _covariance(read, len(read.points), file, where))
+
+
+def _curve(read: _Curve, file: Path, where: str) -> SplineBoundary:
     try:
-        spline = BSpline(entry.array("knots"), entry.array("control_points", columns=2), degree, periodic)
+        spline = BSpline(np.array(read.knots), _rows(read.control_points), read.degree, read.periodic)
     except SettingsError as error:
-        raise entry.error("", str(error)) from None
-    covariance, (low, high) = _covariance(entry, spline.size), spline.domain
-    until = entry.number("confirmed_until") if "confirmed_until" in entry.entries else high
-    if not low <= until <= high:
-        raise entry.error("confirmed_until", f"expected a number from {low:g} to {high:g}, found {until:g}")
-    return SplineBoundary(spline, covariance, until, _cones(entry, low, high))
-
-
-def _cones(entry: _Object, low: float, high: float) -> Array:
-    if "cones" not in entry.entries:
-        return NO_CONES
-    cones = entry.array("cones", columns=2)
+        raise InputError(file, f"{where}: {error}") from None
+    (low, high), until, cones = spline.domain, read.confirmed_until, _rows(read.cones)
+    if until < low or high < until < math.inf:
+        expected = f"expected a number from {low:g} to {high:g}, found {until:g}"
+        raise InputError(file, f"{where}.confirmed_until: {expected}")
     if not ((cones >= [low, 0.0]) & (cones[:, :1] <= high)).all():
-        raise entry.error("cones", f"expected parameters from {low:g} to {high:g} and sigmas from 0 on")
-    return cones
+        expected = f"expected parameters from {low:g} to {high:g} and sigmas from 0 on"
+        raise InputError(file, f"{where}.cones: {expected}")
+    return SplineBoundary(spline, _covariance(read, spline.size, file, where), min(until, high), cones)
 
 
-def _points(top: _Object) -> dict[int, PointBoundary]:
-    found, listed = {}, top.object("points")
-    for name in listed.entries:
-        cones = _boundary(listed.object(name))
-        if LABELS.get(name) not in POINTS or not isinstance(cones, PointBoundary):
-            expected = ", ".join(NAMES[label] for label in POINTS)
-            raise listed.error("", f"expected points of {expected}, found {shown(name)}")
-        found[LABELS[name]] = cones
-    return found
+def _rows(points: list[Point]) -> Array:
+    return np.array(points, float).reshape(-1, 2)
 
 
-def _covariance(entry: _Object, size: int) -> Array:
-    stated = entry.integer("size", 0)
-    if stated != size:
-        raise entry.error("size", f"expected {size} (what is listed), found {stated}")
-    covariance = entry.array("covariance", 2 * size, 2 * size, MAX_COORDINATE**2)
+def _covariance(read: _Points | _Curve, size: int, file: Path, where: str) -> Array:
+    if read.size != size:
+        raise InputError(file, f"{where}.size: expected {size} (what is listed), found {read.size}")
+    covariance = _matrix(read.covariance, (2 * size, 2 * size), file, f"{where}.covariance")
     if not _is_covariance(covariance):
-        raise entry.error("covariance", "expected a symmetric, positive semidefinite matrix")
+        raise InputError(file, f"{where}.covariance: expected a symmetric, positive semidefinite matrix")
     return covariance
 
 
-def _joint_covariance(top: _Object, boundaries: Mapping[int, MapBoundary]) -> Array:
+def _matrix(rows: Matrix, shape: tuple[int, int], file: Path, where: str) -> Array:
+    if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
+        raise InputError(file, f"{where}: expected {shape[0]} rows of {shape[1]} finite numbers")
+    return np.array(rows, float).reshape(shape)
+
+
+def _joint(cross: Matrix, boundaries: Mapping[int, MapBoundary], file: Path) -> Array:
+    where = "cross_covariance"
     if len(boundaries) != len(BOUNDARIES):
-        raise top.error("cross_covariance", f"expected both boundaries, found {len(boundaries)}")
+        raise InputError(file, f"{where}: expected both boundaries, found {len(boundaries)}")
     left, right = (boundaries[label].covariance for label in BOUNDARIES)
-    cross = top.array("cross_covariance", len(right), len(left), MAX_COORDINATE**2)
-    joint = np.block([[left, cross], [cross.T, right]])
+    block = _matrix(cross, (len(left), len(right)), file, where)
+    joint = np.block([[left, block], [block.T, right]])
     if not _is_covariance(joint):
-        raise top.error("cross_covariance", "expected a joint covariance that is positive semidefinite")
+        raise InputError(file, f"{where}: expected a joint covariance that is positive semidefinite")
     return joint
-
-
-class _Object:
-    """A JSON object at a dotted path; an entry that is not as expected is an InputError that names it."""
-
-    def __init__(self, file: Path, path: str, value: Any) -> None:
-        self.file, self._path = file, path
-        if not isinstance(value, dict):
-            raise InputError(file, f"{path or 'the file'}: expected an object, found {type(value).__name__}")
-        self.entries: dict[str, Any] = value
-
-    def error(self, name: str, message: str) -> InputError:
-        return InputError(self.file, f"{self._inner(name)}: {message}")
-
-    def _inner(self, name: str) -> str:
-        return ".".join(filter(None, (self._path, name)))
-
-    def _get(self, name: str) -> Any:
-        if name not in self.entries:
-            raise self.error(name, "expected, but missing")
-        return self.entries[name]
-
-    def object(self, name: str) -> _Object:
-        return _Object(self.file, self._inner(name), self._get(name))
-
-    def boolean(self, name: str) -> bool:
-        value = self._get(name)
-        if not isinstance(value, bool):
-            raise self.error(name, f"expected true or false, found {shown(value)}")
-        return value
-
-    def integer(self, name: str, least: int, most: int = MAX_INTEGER) -> int:
-        value = self._get(name)
-        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-            raise self.error(name, f"expected a whole number from {least} to {most}, found {shown(value)}")
-        return value
-
-    def number(self, name: str) -> float:
-        return _Object(self.file, self._path, {name: [self._get(name)]}).array(name).item()
-
-    def array(
-        self, name: str, columns: int | None = None, rows: int | None = None, largest: float = MAX_COORDINATE
-    ) -> Array:
-        """Return finite numbers, at most `largest` in size: a list, or rows of `columns` values."""
-        value = self._get(name)
-        expected = "a list of finite numbers" if columns is None else f"rows of {columns} finite numbers"
-        try:
-            array = np.asarray(value)
-        except (TypeError, ValueError):
-            array = np.empty(0, dtype=object)
-        good = isinstance(value, list) and array.dtype.kind in "iuf"  # texts and null would become numbers
-        array = array.astype(float) if good else np.full(1, np.nan)
-        if columns is not None and array.size == 0:
-            array = array.reshape(0, columns)
-        shape = (len(array),) if columns is None else (len(array), columns)
-        if array.shape != shape or not np.isfinite(array).all():
-            raise self.error(name, f"expected {expected}")
-        if rows is not None and len(array) != rows:
-            raise self.error(name, f"expected {rows} rows, found {len(array)}")
-        if array.size and np.abs(array).max() > largest:
-            raise self.error(name, f"expected numbers of at most {largest:g} in size, found larger ones")
-        return array
 
 
 def _is_covariance(P: Array) -> bool:

@@ -111,6 +111,8 @@ class CycleRecord:
     """Number of the cycle's detections that were dropped as impossible."""
     refused: int = 0
     """Number of cycles that were refused just before this one."""
+    processor: float = nan
+    """Processor time of this thread in the update, s."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

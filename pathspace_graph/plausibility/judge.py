@@ -95,7 +95,7 @@ def _hints(log: Log) -> list[Hint]:
         return of_ends + found + beyond_any_vehicle(log.odometry)
     trials = Trials(log, telling_pairs(log, pairs))
     others = _reading_hints(trials, found)
-    if others and MapperSettings(kind=log.sensor.kind or kind_of(log)).lines:
+    if others and MapperSettings(kind=kind_of(log)).lines:
         others = _reading_hints(trials, found, stay=False)
     return of_ends + others
 
@@ -209,6 +209,8 @@ def _motion_hints(trials: Trials, *, stay: bool) -> list[Hint]:
     if len(trials.pairs) == 0:
         return beyond_any_vehicle(trials.log.odometry)
     best, found = _interpretation(trials)
+    if best.hypothesis.content == "nothing" and not stay:
+        return []  # walls look alike from everywhere along them
     if best.hypothesis.content == "nothing" or (found and camera(trials.pairs)):
         return found
     late, of_clocks = _latency(trials, best)

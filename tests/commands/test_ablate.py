@@ -69,6 +69,16 @@ def test_the_command_leaves_tables_and_figures(
     with pytest.raises(SystemExit):
         main(["ablate", str(file), "--out", str(out), "--jobs", "1"])
     assert contents(out) == before
+    for baseline, said in (
+        ("lag=1", "difference from lag=1"),
+        ("fragile", "difference from fragile: default"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["ablate", str(file), "--out", str(out), "--jobs", "1", "--baseline", baseline])
+        assert said in capsys.readouterr().out
+    assert {name: text for name, text in contents(out).items() if name.startswith("cells/")} == {
+        name: text for name, text in before.items() if name.startswith("cells/")
+    }
 
 
 @pytest.mark.slow
@@ -89,6 +99,7 @@ def test_the_command_takes_other_tracks_seeds_and_laps(
     [
         (["STUDY", "--jobs", "0"], "jobs: expected"),
         (["STUDY", "--laps", "0"], "laps: expected"),
+        (["STUDY", "--baseline", "lag=2"], "--baseline: expected a variant or an estimator"),
         (["STUDY", "--tracks", "none.yaml"], "none.yaml"),
         (["lagg"], "the nearest is 'lag'"),
         (["none.toml"], "none.toml"),

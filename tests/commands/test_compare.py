@@ -49,7 +49,9 @@ def test_the_command_writes_tables_figures_and_maps(
     printed = capsys.readouterr()
     assert "rmse [m]" in printed.out and "ghost curve [m]" not in printed.out
     assert "ghost curve [m]" in (out / "metrics.md").read_text()
-    assert printed.err == "rings-batch on a: not converged\n"
+    *told, unsettled = printed.err.splitlines()
+    assert unsettled == "rings-batch on a: not converged"
+    assert [line.split(",")[0] for line in told] == [f"comparing: {done} of 3" for done in range(4)]
     files = {f"{name}.{suffix}" for name in ("table", "metrics") for suffix in ("csv", "md", "tex")}
     figures = {f"{name}.{suffix}" for name in ("maps", "blind_spot") for suffix in ("png", "pdf")}
     assert {path.name for path in out.iterdir()} == files | figures | {
@@ -80,6 +82,7 @@ def test_a_second_comparison_keeps_the_first_and_a_failure_ends_in_3(
     with pytest.raises(SystemExit):
         main(command)
     assert (tmp_path / "out.~1~" / "comparison.json").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"out", "out.~1~"}, "nothing unfinished is left"
 
 
 def test_where_all_fail_the_tables_say_so(

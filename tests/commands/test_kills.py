@@ -16,11 +16,13 @@ from matplotlib.figure import Figure
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.cli import parse_command
+from pathspace_graph.eval.benchmark.lanes import CONES, LAPS, READINGS, fit_slope
 from pathspace_graph.eval.benchmark.roads import ScalingSettings
-from pathspace_graph.eval.benchmark.scaling import CONES, LAPS, READINGS, Scaling, fit_slope
+from pathspace_graph.eval.benchmark.scaling import Scaling
 from pathspace_graph.eval.experiment.cells import run_estimator
-from pathspace_graph.eval.experiment.compare import Comparison, compare, read_logs
+from pathspace_graph.eval.experiment.compare import Comparison, compare, plan_of
 from pathspace_graph.eval.experiment.tables import TextTable
+from pathspace_graph.eval.metrics.measures import Row
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.log import Log, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
@@ -70,7 +72,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 def comparison(recorded: Recorded) -> Comparison:
     with pytest.MonkeyPatch.context() as patch:
         rings.register(patch)
-        return compare(read_logs(recorded.folder / "log"), ["rings"], MapperSettings())
+        return compare(plan_of(recorded.folder / "log", ["rings"]), recorded.folder / "cells")
 
 
 @pytest.fixture(autouse=True)
@@ -78,7 +80,6 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
     """Whatever is computed is taken from the record, a picture is a few bytes, and nothing is printed."""
     rings.register(monkeypatch)
     monkeypatch.setitem(registry.ONLINE, "fixed-lag", rings.Rings)  # the shipped studies name it
-    monkeypatch.setattr("os.fsync", lambda _: None)  # the killer loses what was not flushed
     picture = Figure()
     monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: Path(file).write_bytes(b"picture"))
     answers = {
@@ -90,7 +91,6 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
         "commands.estimate.map_online": recorded.result,
         "commands.estimate.report": None,
         "commands.plot.plot_map": picture,
-        "eval.experiment.compare.read_logs": [],
         "commands.compare.compare": comparison,
         "commands.compare.Compare._report": None,
         "commands.studies.make_drives": Roads(),
@@ -104,7 +104,7 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
     judged = recorded.log, []
     answers["commands.estimate.read_plausible_log"] = judged
     answers["commands.plot.read_log"] = recorded.log
-    rooms = ("commands.compare", "commands.estimate", "eval.experiment.compare")
+    rooms = ("commands.compare", "commands.estimate", "eval.experiment.cells")
     answers |= {f"{room}.summarize": {} for room in rooms}
     for name, answer in answers.items():
         monkeypatch.setattr(f"pathspace_graph.{name}", lambda *_, _answer=answer, **__: _answer)
@@ -186,7 +186,7 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new(
         place(target, new)
     before = [content_of(target)] if old else []
     for step, _ in enumerate(kills(work, folder), 1):
-        if old or target.exists():
+        if target.exists():
             check(target, [*before, new])
         if old and step % every == 0:
             work()
@@ -210,10 +210,11 @@ estimators = ["rings"]
 def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     name: str, recorded: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study, rows = "pathspace_graph.eval.experiment", [{"lap": 1, "rmse": 0.5}]
-    monkeypatch.setattr(f"{study}.drives.Drive.load", lambda _: recorded.log)
-    monkeypatch.setattr(f"{study}.cells.lap_rows", lambda *_, **__: rows)
-    monkeypatch.setattr(f"{study}.cells.made", lambda _: versions() | {"date": "then"})
+    study, rows = "pathspace_graph.eval.experiment", [Row(1, {"rmse": 0.5}), Row(None, {})]
+    monkeypatch.setattr(f"{study}.drives.Drive.load", lambda _: (recorded.log, ()))
+    monkeypatch.setattr(f"{study}.cells.measure", lambda *_, **__: rows)
+    monkeypatch.setattr(f"{study}.cells.stage_times", lambda _: [])
+    monkeypatch.setattr(f"{study}.runner.made", lambda _: versions() | {"date": "then"})
     monkeypatch.setattr(f"{study}.tables.plot_differences", lambda *_: Figure())
     monkeypatch.setattr(f"{study}.faults.plot_faults", lambda *_: Figure())
     track = write_round_track(tmp_path)

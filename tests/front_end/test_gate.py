@@ -429,3 +429,15 @@ def test_a_detector_with_stamps_in_milliseconds_may_give_a_cycle_in_each() -> No
     """4.201 - 4.2 is less than 0.001 in doubles."""
     assert 4.201 - 4.2 < 1e-3
     assert Gate(LIMITS).admit(NONE, detections(4.201), Newest(4.2)).refused == 0
+
+
+def test_a_laser_scan_is_thinned_evenly_where_points_are_of_lines() -> None:
+    """1,080 points along y = 2 become every third of them; as cones they are refused."""
+    x = np.linspace(0.1, 20.0, 1080)
+    points, covariances = np.column_stack([x, np.full(1080, 2.0)]), np.tile(0.01 * np.eye(2), (1080, 1, 1))
+    scan = Detections(4.3, points, covariances, np.zeros(1080, int))
+    admitted = Gate(LIMITS, of_lines=True).admit(NONE, scan, Newest(4.2))
+    np.testing.assert_array_equal(admitted.detections.points_vehicle, points[::3])
+    assert admitted.dropped == 0
+    with pytest.raises(ReadingError, match="at most 500 rows, found 1080"):
+        Gate(LIMITS).admit(NONE, scan, Newest(4.2))

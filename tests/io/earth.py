@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.io.export import FLATTENING, SEMI_MAJOR_AXIS, LocalPlane
+from pathspace_graph.io.export import LocalPlane
 
 Array = NDArray[np.float64]
+SEMI_MAJOR_AXIS = 6_378_137.0
+FLATTENING = 1.0 / 298.257223563
 SQUARE = FLATTENING * (2.0 - FLATTENING)
 
 

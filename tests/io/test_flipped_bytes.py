@@ -7,24 +7,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.experiment.cells import Cell, Outcome, read_record, record_of, write_record
-from pathspace_graph.eval.experiment.drives import Drive
+from pathspace_graph.eval.experiment.run import make_plan
+from pathspace_graph.eval.experiment.runner import read_record, write_record
+from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.log import FILES, read_log, write_log
 from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import read_trajectory, write_result
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim.simulate import SimulationSettings
-from pathspace_graph.sim.track_files import read_track
 
 from ..scenes.pretenders import write_round_track
 from .test_log import small_log
@@ -90,11 +87,8 @@ def test_in_a_manifest(folder: str, written: Path) -> None:
 
 def test_in_a_cell_of_a_study(tmp_path: Path) -> None:
     """A damaged cell is run again."""
-    track = replace(read_track(write_round_track(tmp_path)), name="round")
-    cell = Cell(Drive(track, 0, "nominal", SimulationSettings()), "fixed-lag", MapperSettings(), "default")
-    record = record_of(cell, Outcome.failed(cell, ValueError("lost"))) | {
-        "laps": [{"lap": 1, "rmse": 0.123456}]
-    }
+    cell = make_plan(Study(tracks=(write_round_track(tmp_path),))).cells[0]
+    record = cell.failed(ValueError("lost")) | {"rows": [{"lap": 1, "rmse": 0.123456}]}
     write_record(tmp_path, cell, record)
     assert read_record(tmp_path, cell) == record
     (file,) = (tmp_path / "cells").iterdir()

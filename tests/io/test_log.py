@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -169,7 +171,7 @@ BAD_ROWS = [
         "odometry.csv",
         "t,vx,vy,wz\n0,1,0,0\n0.1,1e5,0,0\n",
         3,
-        "1000 m/s in size in column 'vx', found '1e5'",
+        "1000 m/s in size in column 'vx', found 100000",
     ),
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.1,1,0,-1e9\n", 3, "at most 1000 rad/s in size in column 'wz'"),
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1000000000000000000,1,0,0\n", 3, "1e+10 s in size in column 't'"),
@@ -311,3 +313,45 @@ def test_a_log_that_cannot_be_read_is_not_written_where_it_is_checked(tmp_path: 
     assert not list(tmp_path.iterdir())
     write_log(log, tmp_path / "log")
     assert (tmp_path / "log").is_dir()
+
+
+def test_a_log_of_arrays_is_the_one_that_is_read_from_files() -> None:
+    log = small_log()
+    cycles = log.cycles
+    stamps = np.repeat([cycle.t for cycle in cycles], 3)
+    points = np.concatenate([cycle.points_vehicle for cycle in cycles])
+    covariances = np.concatenate([cycle.covariances for cycle in cycles])
+    labels = ["left", "yellow", UNKNOWN] * 3
+    noise = {"covariances": covariances, "odometry_sigma": log.odometry_sigma}
+    made = Log.from_arrays(
+        log.odometry.t, log.odometry.twist, stamps, points, labels=labels, kind="line", **noise
+    )
+    assert made.odometry_stated and made.detections_stated
+    assert_same(made, replace(log, truth=None, source={}, sensor=SensorInfo(kind="line")))
+
+
+def test_arrays_without_noise_state_none() -> None:
+    log = Log.from_arrays([0.0, 1.0], np.zeros((2, 3)), [0.5], [[3.0, 1.0]])
+    assert (log.odometry_stated, log.detections_stated) == (False, False)
+    assert log.cycles[0].labels.tolist() == [UNKNOWN]
+    assert np.linalg.eigvalsh(log.cycles[0].covariances[0]).min() > 0.0
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"t": [0.0, 0.0]}, "odometry, row 2: expected a time later than the row before"),
+        ({"t": [0.0, 1.0, 2.0]}, "odometry: expected arrays of numbers with a row each"),
+        ({"twist": np.zeros((2, 2))}, "odometry: expected the columns t, vx, vy, wz, found 3"),
+        ({"twist": [[0.0, np.nan, 0.0]] * 2}, "odometry, row 1: expected a finite number in column 'vy'"),
+        ({"points": [[3.0, 1e5]]}, "detections, row 1: expected a number of at most 10000 m in size"),
+        ({"labels": [7]}, "detections, row 1: expected a number of at most 4 in size in column 'label'"),
+        ({"covariances": [[[1.0, 2.0], [2.0, 1.0]]]}, "detections, row 1: expected a positive definite"),
+        ({"detection_t": [-1.0]}, "detections, row 1: expected a time not before the first odometry"),
+    ],
+)
+def test_an_array_that_is_wrong_is_named_with_its_row(changed: dict[str, Any], says: str) -> None:
+    good = {"t": [0.0, 1.0], "twist": np.zeros((2, 3)), "detection_t": [0.5], "points": [[3.0, 1.0]]}
+    with pytest.raises(InputError) as caught:
+        Log.from_arrays(**{**good, **changed})
+    assert str(caught.value).startswith(says)

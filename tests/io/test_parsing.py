@@ -10,11 +10,9 @@ from typing import Any
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io import parsing as limits
 from pathspace_graph.io.parsing import (
     MAX_DEPTH,
     MAX_INTEGER,
-    check_content,
     parse_json,
     parse_toml,
     parse_yaml,
@@ -59,23 +57,6 @@ def test_whole_numbers_beyond_64_bits_are_refused(
     assert parse(text.format(MAX_INTEGER), FILE)
     with pytest.raises(InputError):
         parse(text.format("9" * digits), FILE)
-
-
-def test_what_aliases_name_many_times_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Thirty lists, each of which has the one before it twice, and one that has itself."""
-    looked: list[int] = []
-    children = limits._children
-
-    def count(value: Any) -> Any:
-        looked.append(id(value))
-        return children(value)
-
-    monkeypatch.setattr(limits, "_children", count)
-    doubled = "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 30))
-    check_content(parse_yaml(f"a0: &a0 [1]\n{doubled}loop: &b [1, *b]\n", FILE), FILE)
-    assert len(looked) < 1000
-    with pytest.raises(InputError, match="whole numbers"):
-        parse_yaml(f"a0: &a0 [{MAX_INTEGER + 1}]\n{doubled}", FILE)
 
 
 @pytest.mark.parametrize(

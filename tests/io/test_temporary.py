@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
 from pathspace_graph.errors import OutputError
-from pathspace_graph.io import files
 from pathspace_graph.io.files import atomic_file, atomic_folder, check_target, is_temporary, write_text
 
 from ..scenes.kills import leftovers
@@ -69,60 +69,31 @@ def test_a_folder_with_leftovers_only_is_an_empty_one(tmp_path: Path) -> None:
     assert not is_temporary(".study.json") and not is_temporary("study.0123abcd.tmp.json")
 
 
-@pytest.mark.parametrize("has_exchange", [True, False])
-def test_an_exchange_is_one_step_or_goes_by_way_of_a_spare_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_exchange: bool
-) -> None:
-    if not has_exchange:
-        monkeypatch.setattr(files, "_renameat2", lambda: None)
-    for name in "ab":
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "file").write_text(name)
-    files.exchange(tmp_path / "a", tmp_path / "b", tmp_path / "spare")
-    assert (tmp_path / "a" / "file").read_text() == "b"
-    assert (tmp_path / "b" / "file").read_text() == "a"
-    assert not files.rename_new(tmp_path / "a", tmp_path / "b")
-    assert files.rename_new(tmp_path / "a", tmp_path / "c")
-    assert names(tmp_path) == ["b", "c"]
-
-
-def test_results_are_kept_where_the_system_can_not_exchange(
+def test_results_are_kept_where_there_are_no_hard_links(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(files, "_renameat2", lambda: None)
+    monkeypatch.setattr(os, "link", refuse)
     for text in "123":
-        with atomic_folder(tmp_path / "out", "marker") as folder:
-            (folder / "marker").write_text(text)
         with atomic_file(tmp_path / "f.txt") as file:
             file.write_text(text)
-    assert names(tmp_path) == ["f.txt", "f.txt.~1~", "f.txt.~2~", "out", "out.~1~", "out.~2~"]
-    assert [(tmp_path / f"out{end}" / "marker").read_text() for end in ("", ".~1~", ".~2~")] == [
-        "3",
-        "1",
-        "2",
-    ]
+    assert [(tmp_path / f"f.txt{end}").read_text() for end in ("", ".~1~", ".~2~")] == ["3", "1", "2"]
 
 
-def test_a_failed_exchange_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise PermissionError(13, "Permission denied")
+def test_a_folder_that_cannot_be_put_in_place_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with atomic_folder(tmp_path / "out", "marker") as folder:
+        (folder / "marker").write_text("1")
+    rename = Path.rename
 
-    write_text(tmp_path / "f.txt", "1")
-    monkeypatch.setattr(files, "exchange", fail)
-    with pytest.raises(OutputError, match="Permission denied"), atomic_file(tmp_path / "f.txt") as file:
-        file.write_text("2")
-    assert names(tmp_path) == ["f.txt"]
-    assert (tmp_path / "f.txt").read_text() == "1"
+    def fail(path: Path, target: Path) -> Path:
+        return refuse() if ".tmp" in path.name else rename(path, target)
+
+    with pytest.raises(OutputError, match="Permission denied"), atomic_folder(tmp_path / "out", "marker"):
+        monkeypatch.setattr(Path, "rename", fail)
+    assert names(tmp_path) == ["out"]
+    assert (tmp_path / "out" / "marker").read_text() == "1"
 
 
-def test_locks_hold_until_they_are_closed_and_know_what_is_gone(tmp_path: Path) -> None:
-    file = tmp_path / "f"
-    file.touch()
-    held = files.lock(file, wait=True)
-    assert held is not None
-    assert files.lock(file, wait=False) is None
-    os.close(held)
-    again = files.lock(file, wait=False)
-    assert again is not None
-    os.close(again)
-    assert files.lock(tmp_path / "none", wait=True) is None
+def refuse(*_: object, **__: object) -> NoReturn:
+    raise PermissionError(13, "Permission denied")

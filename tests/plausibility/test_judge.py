@@ -9,8 +9,8 @@ import pytest
 
 from pathspace_graph import hints
 from pathspace_graph.eval.hints import GOOD, backs_up, causes_of, in_unix_time, one_boundary, stands_first
-from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
+from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.plausibility.judge import positions_in_metres
 from pathspace_graph.sim.mistakes import MISTAKES, in_frame, late, with_points, with_twists
 
@@ -229,6 +229,17 @@ def test_detections_that_do_not_last_for_the_drive_are_told(
 @pytest.mark.parametrize("spacing", [0.25, 4.0])
 def test_a_drive_along_lines_is_not_accused_of_moving_cones(spacing: float) -> None:
     assert hints(line_drive(1, spacing)) == []
+
+
+def test_straight_walls_do_not_say_that_the_vehicle_stands() -> None:
+    """From everywhere between them two walls look the same, as if nothing had moved."""
+    at, t = np.arange(0.5, 15.0, 0.5), np.arange(0.0, 20.0, 0.1)
+    points = np.concatenate([np.column_stack([at, np.full(len(at), side)]) for side in (1.75, -1.75)])
+    labels, covariances = np.repeat([LEFT, RIGHT], len(at)), np.tile(0.01 * np.eye(2), (2 * len(at), 1, 1))
+    cycles = tuple(Detections(stamp, points, covariances, labels) for stamp in t.tolist())
+    odometry = Odometry(t, np.tile([2.5, 0.0, 0.0], (len(t), 1)))
+    log = Log(odometry, cycles, np.array([0.1, 0.05, 0.02]), SensorInfo(kind="line"))
+    assert hints(log) == []
 
 
 def test_the_unit_of_the_positions_is_told_of_lines_as_well() -> None:

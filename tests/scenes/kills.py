@@ -10,14 +10,13 @@ import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from pathspace_graph.io.files import RENAME, SYNC
-
 from .pretenders import contents
 
 Contents = dict[str, bytes]
 
-STEPS = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.truncate", SYNC, RENAME}
-"""Python announces a change of the disk by one of these audit events, or by `open`."""
+SYNC = "fsync"
+STEPS = {"os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.truncate", SYNC}
+"""Audit events of changes of the disk, beside `open`; SYNC is the recorder's."""
 
 
 class Recorder:
@@ -28,7 +27,7 @@ class Recorder:
 
     def __init__(self, root: Path, cuts: Path) -> None:
         self._root, self._cuts, self._steps = root, cuts, 0
-        self._kept = {file.stat().st_ino for file in root.rglob("*") if file.is_file()}
+        self._kept: set[object] = {file.stat().st_ino for file in root.rglob("*") if file.is_file()}
         self._is_recording = False
 
     def __call__(self, event: str, arguments: tuple[object, ...]) -> None:
@@ -38,7 +37,7 @@ class Recorder:
         self._steps += 1
         shutil.copytree(self._root, self._cuts / str(self._steps), copy_function=self._copy)
         if event == SYNC:
-            self._kept.add(Path(str(arguments[0])).stat().st_ino)
+            self._kept.add(arguments[0])
         self._is_recording = False
 
     def _is_step(self, event: str, arguments: tuple[object, ...]) -> bool:
@@ -64,6 +63,7 @@ def kills(work: Callable[[], object], root: Path) -> Iterator[bool]:
         child = os.fork()
     if child == 0:
         sys.addaudithook(Recorder(root, cuts))
+        os.fsync = lambda descriptor: sys.audit(SYNC, os.fstat(descriptor).st_ino)  # type: ignore[assignment]
         try:
             work()
         except BaseException:

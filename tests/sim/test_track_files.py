@@ -216,17 +216,17 @@ def test_rows_without_a_road_between_them_are_refused(tmp_path: Path) -> None:
 
 BAD_YAML = [
     ({"left": "left: []"}, "at least 3 cones of the left boundary"),
-    ({"left": "lefty: []"}, "key track.left"),
-    ({"start": "begin: 0"}, "key track.start"),
+    ({"left": "lefty: []"}, "track.left: expected, but missing"),
+    ({"start": "begin: 0"}, "track.start: expected, but missing"),
     ({"start": "start: {position: [0, -10, 0], orientation: [0, 0]}"}, "track.start.orientation"),
     ({"start": "start: {position: [0, 80, 0], orientation: [0, 0, 0]}"}, "start on the track"),
     ({"start": "start: {position: [0, -10, 0], orientation: [0, 0, 3]}"}, "driving order"),
-    ({"right": "right: [{position: [1, .nan, 0]}]"}, "finite numbers at track.right[0].position"),
-    ({"right": "right: [{position: [1, word, 0]}]"}, "2 numbers at track.right[0].position"),
-    ({"right": "right: [{position: 3}]"}, "2 numbers at track.right[0].position"),
-    ({"right": "right: [{place: 3}]"}, "key track.right[0].position"),
-    ({"right": "right: {a: 3}"}, "a list at track.right"),
-    ({"closed": "lanesFirstWithLastConnected: perhaps"}, "true or false"),
+    ({"right": "right: [{position: [1, .nan, 0]}]"}, "track.right[0].position[1]: expected float"),
+    ({"right": "right: [{position: [1, word, 0]}]"}, "track.right[0].position"),
+    ({"right": "right: [{position: 3}]"}, "track.right[0].position"),
+    ({"right": "right: [{place: 3}]"}, "track.right[0].position: expected, but missing"),
+    ({"right": "right: {a: 3}"}, "track.right: expected array"),
+    ({"closed": "lanesFirstWithLastConnected: perhaps"}, "track.lanesFirstWithLastConnected: expected bool"),
     ({"closed": "lanesFirstWithLastConnected: ["}, "expected YAML"),
 ]
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.benchmark import scaling as lanes
-from pathspace_graph.eval.benchmark.scaling import JUDGED, Lane, peak_memory, run_lanes
+from pathspace_graph.eval.benchmark import lanes
+from pathspace_graph.eval.benchmark.lanes import JUDGED, Lane, peak_memory, run_lanes
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.settings.mapper import MapperSettings
 

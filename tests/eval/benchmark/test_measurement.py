@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 import pytest
+from rich.console import Console
 
-from pathspace_graph.eval.benchmark.measurement import Measurement, measure, metrics
+from pathspace_graph.eval.benchmark.measurement import (
+    Measurement,
+    Metric,
+    ToldLandmarks,
+    measure,
+    metrics,
+    metrics_table,
+)
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from ...scenes.drives import bean_track, beginning
+from ...scenes.drives import ahead, bean_track, beginning, corridor, exact_log
 from .timing import record
 
 
@@ -60,3 +70,35 @@ def test_the_swap_is_compared_with_the_cycles_around_it() -> None:
     assert figures["meanwhile_by_after"].value == pytest.approx(0.75)
     assert not figures["meanwhile_by_before"].holds and figures["swap"].holds
     assert "swap" not in {metric.key for metric in metrics(unswapped)}
+
+
+def test_a_bound_is_kept_or_not() -> None:
+    assert Metric("a", 2.0, "", bound=2.0).holds
+    assert not Metric("a", 2.1, "", bound=2.0).holds
+    assert not Metric("a", float("nan"), "", bound=2.0).holds
+    assert Metric("a", float("nan"), "").holds
+
+
+def test_a_table_shows_each_figure_beside_its_bound() -> None:
+    figures = [Metric("mean_by_isam2", 1.234, "", bound=2.0), Metric("closing", float("nan"), "ms")]
+    console = Console(width=100, file=io.StringIO(), record=True)
+    console.print(metrics_table(figures).rich())
+    lines = console.export_text().splitlines()
+    assert any("mean_by_isam2" in line and "1.23" in line and "<= 2" in line for line in lines)
+
+
+def test_the_landmarks_are_the_detected_cones() -> None:
+    log = simulate(bean_track(), SimulationSettings(laps=2), 0)
+    told = ToldLandmarks(log)
+    assert all(told.advance() > 0.0 for _ in log.cycles)
+    assert log.truth is not None and log.truth.associations is not None
+    cones, estimate = sorted(set(np.unique(log.truth.associations)) - {-1}), told.isam.calculateEstimate()
+    points = [estimate.atPoint2(gtsam.symbol("l", cone)) for cone in cones]
+    assert estimate.size() == len(log.cycles) + len(cones)
+    errors = np.linalg.norm(np.array(points) - log.truth.cones[cones], axis=1)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.3
+
+
+def test_a_log_without_associations_is_refused() -> None:
+    with pytest.raises(ValueError, match="associations"):
+        ToldLandmarks(exact_log(ahead(8.0, 1.0), *corridor(20.0)))

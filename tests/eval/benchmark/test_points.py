@@ -6,8 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pathspace_graph.eval.benchmark.lanes import CONES, LAPS, Lane, binned, fit_slope
 from pathspace_graph.eval.benchmark.roads import ScalingSettings
-from pathspace_graph.eval.benchmark.scaling import CONES, LAPS, Lane, Scaling, binned, fit_slope
+from pathspace_graph.eval.benchmark.scaling import Scaling
 from pathspace_graph.io.log import Log, Odometry
 
 NO_LOG = Log(Odometry(np.zeros(1), np.zeros((1, 3))), (), np.ones(3))

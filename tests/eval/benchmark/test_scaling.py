@@ -10,12 +10,10 @@ import pytest
 
 from pathspace_graph import cli
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.eval.benchmark.lanes import CONES, LAPS, READINGS
 from pathspace_graph.eval.benchmark.roads import ScalingSettings, make_drives
 from pathspace_graph.eval.benchmark.scaling import (
-    CONES,
-    LAPS,
     MARKER,
-    READINGS,
     measure_scaling,
     scaling_table,
     stops,
@@ -30,9 +28,14 @@ pytestmark = pytest.mark.usefixtures("png_only")
 @pytest.mark.slow
 def test_a_small_measurement_end_to_end(tmp_path: Path) -> None:
     drives = make_drives(SMALL)
-    told: list[int] = []
-    scaling = measure_scaling(["fixed-lag"], drives, SMALL, on_cycle=lambda: told.append(1))
-    assert len(told) == drives.cycles
+    told: list[tuple[int, int]] = []
+    kept = tmp_path / "kept"
+    scaling = measure_scaling(["fixed-lag"], drives, SMALL, None, kept, lambda *of: told.append(of))
+    assert told == [(k, drives.cycles) for k in range(1, drives.cycles + 1)]
+    again = measure_scaling(["fixed-lag"], drives, SMALL, None, kept, lambda *of: told.append(of))
+    assert len(told) == drives.cycles, "what was measured is kept"
+    pd.testing.assert_frame_equal(again.points, scaling.points)
+    pd.testing.assert_frame_equal(again.slopes, scaling.slopes)
     assert scaling.of(LAPS, "fixed-lag")["at"].tolist() == [1.0, 2.0]
     assert scaling.of(READINGS, "fixed-lag")["at"].tolist() == [2.0, 6.0, 12.0]
     assert len(scaling.of(CONES, "fixed-lag")) == 4

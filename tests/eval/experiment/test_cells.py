@@ -8,43 +8,36 @@ import pytest
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.experiment import cells
-from pathspace_graph.eval.experiment.cells import Cell, run_cell
-from pathspace_graph.eval.experiment.drives import NamedLog
-from pathspace_graph.io.log import Log, read_log
-from pathspace_graph.io.results import RunResult
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.eval.experiment.compare import plan_of
 
 from ...scenes.rings import register, write_logs
 
 
 @pytest.fixture
-def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Log:
+def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     register(monkeypatch)
-    return read_log(write_logs(tmp_path / "round") / "a")
+    return write_logs(tmp_path / "round") / "a"
 
 
-def cell(estimator: str, log: Log) -> Cell[NamedLog]:
-    return Cell(NamedLog("a", log), estimator, MapperSettings())
-
-
-def test_a_run_is_measured(log: Log) -> None:
-    found = run_cell(cell("rings", log))
-    assert found.names == {"log": "a", "estimator": "rings"}
-    assert [row.lap for row in found.rows] == [1, 2, None]
-    assert found.rows[-1].values["seconds"] > 0.0
-    assert found.result is not None and found.result.estimator == "rings"
-    assert found.failure == found.trace == ""
+def test_a_run_is_measured_and_its_files_are_kept(log: Path) -> None:
+    found = plan_of(log, ("rings",)).cells[0].record()
+    assert found["cell"]["track"] == "a" and found["cell"]["estimator"] == "rings"
+    assert [row["lap"] for row in found["rows"]] == [1, 2, None]
+    assert found["rows"][-1]["seconds"] > 0.0 and found["rows"][-1]["seconds_processor"] > 0.0
+    assert {"map.json", "trajectory.tum", "cycles.csv", "summary.json"} <= set(found["files"])
+    assert found["failure"] == found["traceback"] == ""
 
 
 def test_a_failure_of_the_run_and_of_the_measure_are_results(
-    log: Log, monkeypatch: pytest.MonkeyPatch
+    log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def measure(result: RunResult, log: Log, seconds: float) -> None:
+    def measure(*_: object, **__: object) -> None:
         raise SettingsError("two\n  lines")
 
-    assert run_cell(cell("broken", log)).failure == "ValueError: lost the way"
+    broken, rings = plan_of(log, ("broken", "rings")).cells
+    assert broken.record()["failure"] == "ValueError: lost the way"
     monkeypatch.setattr(cells, "measure", measure)
-    found = run_cell(cell("rings", log))
-    assert found.result is None and not found.rows
-    assert found.failure == "SettingsError: two lines"
-    assert "in measure" in found.trace
+    found = rings.record()
+    assert found["rows"] == [] and "files" not in found
+    assert found["failure"] == "SettingsError: two lines"
+    assert "in measure" in found["traceback"]

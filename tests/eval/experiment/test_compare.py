@@ -12,21 +12,18 @@ from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.experiment.compare import (
     Comparison,
-    NamedLog,
-    choose,
-    choose_reference,
     compare,
     final_table,
     paired_frame,
     paper_frame,
     paper_table,
-    read_logs,
+    plan_of,
     side_by_side,
     tables,
 )
-from pathspace_graph.eval.experiment.plots import find_blind_spot, plot_maps
+from pathspace_graph.eval.experiment.plots import Drawn, find_blind_spot, plot_maps
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
-from pathspace_graph.io.log import Truth, read_log
+from pathspace_graph.io.log import Truth, read_log, write_log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT
 from pathspace_graph.settings.mapper import MapperSettings
@@ -48,47 +45,45 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def logs(folder: Path) -> list[NamedLog]:
-    """Both logs, as they are read and judged."""
-    return read_logs(folder)
-
-
-@pytest.fixture(scope="module")
-def compared(logs: list[NamedLog]) -> Comparison:
+def compared(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Comparison:
     """Two estimators on both logs."""
     with pytest.MonkeyPatch.context() as patch:
         register(patch)
-        return compare(logs, ["rings", "gaps"], reference="gaps")
+        return compare(plan_of(folder, ("rings", "gaps"), "gaps"), tmp_path_factory.mktemp("cells"))
 
 
 # --- choice ----------------------------------------------------------------------------------------------
 
 
-def test_estimators_are_those_named_or_all_that_are_known() -> None:
-    assert choose(()) == ("rings", "gaps", "broken", "rings-batch")
-    assert choose(("gaps", "rings", "gaps")) == ("gaps", "rings")
+def test_estimators_are_those_named_or_all_that_are_known(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = plan_of(folder / "a").study
+    assert found.estimators == ("rings", "gaps", "broken", "rings-batch")
+    assert found.baseline.estimator == "rings"
+    assert plan_of(folder, ("gaps", "rings", "gaps")).study.estimators == ("gaps", "rings")
     with pytest.raises(SettingsError, match=r"a known estimator, found 'nothing'$"):
-        choose(("nothing",))
-    assert choose_reference(None, ("gaps", "rings")) == "gaps"
-    assert choose_reference(None, ("gaps", registry.DEFAULT_ONLINE)) == registry.DEFAULT_ONLINE
+        plan_of(folder, ("nothing",))
     with pytest.raises(SettingsError, match="--reference"):
-        choose_reference("rings", ("gaps",))
+        plan_of(folder, ("gaps",), "rings")
+    monkeypatch.setitem(registry.ONLINE, registry.DEFAULT_ONLINE, Gaps)  # type: ignore[misc]
+    both = plan_of(folder, ("gaps", registry.DEFAULT_ONLINE)).study
+    assert both.baseline.estimator == registry.DEFAULT_ONLINE
 
 
-def test_logs_of_a_folder(logs: list[NamedLog], folder: Path, tmp_path: Path) -> None:
-    assert [named.name for named in logs] == ["a", "b"]
-    assert [named.name for named in read_logs(folder / "a")] == ["a"]
-    with pytest.raises(InputError, match="found neither"):
-        read_logs(tmp_path)
-    with pytest.raises(InputError):
-        read_logs(tmp_path / "nowhere")
+def test_logs_of_a_folder(folder: Path, tmp_path: Path) -> None:
+    assert [*plan_of(folder).study.logs] == ["a", "b"]
+    assert [*plan_of(folder / "a").study.logs] == ["a"]
+    for nothing in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(InputError, match="found neither"):
+            plan_of(nothing)
 
 
 # --- results ---------------------------------------------------------------------------------------------
 
 
-def test_rows_are_of_each_lap_and_of_the_log(logs: list[NamedLog]) -> None:
-    frame = compare(logs[:1], ["rings", "rings-batch"]).frame
+def test_rows_are_of_each_lap_and_of_the_log(folder: Path, tmp_path: Path) -> None:
+    frame = compare(plan_of(folder / "a", ("rings", "rings-batch")), tmp_path).frame
     own = frame[frame["estimator"] == "rings"]
     assert own["scope"].tolist() == ["lap", "lap", "log"]
     assert own["lap"].tolist()[:2] == [1, 2]
@@ -103,15 +98,31 @@ def test_rows_are_of_each_lap_and_of_the_log(logs: list[NamedLog]) -> None:
     assert own["ate"].iloc[-1] ** 2 == pytest.approx((own["along"] ** 2 + own["across"] ** 2).iloc[-1])
 
 
-def test_a_failure_is_told_and_the_rest_goes_on(logs: list[NamedLog]) -> None:
+def test_a_failure_is_told_and_the_rest_goes_on(folder: Path, tmp_path: Path) -> None:
     told: list[int] = []
-    found = compare(logs, ["broken", "rings"], on_run=lambda done, _: told.append(done))
-    assert [tuple(o.names.values()) for o in found.failures] == [("a", "broken"), ("b", "broken")]
-    assert found.failures[0].failure == "ValueError: lost the way"
+    plan = plan_of(folder, ("broken", "rings"))
+    found = compare(plan, tmp_path, on_cell=lambda done, _: told.append(done))
+    assert [tuple(of.values()) for of in found.failures] == [
+        ("a", "broken", "ValueError: lost the way"),
+        ("b", "broken", "ValueError: lost the way"),
+    ]
     assert told == [0, 1, 2, 3, 4] and len(found.frame) == 6
     assert set(found.times()["stage"]) == {"whole", "guess"}
     table = paper_table(found)
     assert table.rows[0][:2] == ("broken", "failed")
+
+
+def test_a_comparison_that_was_killed_goes_on(folder: Path, tmp_path: Path) -> None:
+    plan, told = plan_of(folder, ("rings", "gaps")), list[tuple[int, int]]()
+
+    def kill(done: int, _: int) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compare(plan, tmp_path, on_cell=kill)
+    found = compare(plan, tmp_path, on_cell=lambda *steps: told.append(steps))
+    assert told == [(0, 1), (1, 1)] and not found.failures
 
 
 def test_the_paper_s_table_is_the_mean_over_logs(compared: Comparison) -> None:
@@ -137,20 +148,16 @@ def test_differences_are_paired_over_logs(compared: Comparison) -> None:
     assert (size["mean"], size["low"], size["high"]) == (-4.0, -4.0, -4.0)
 
 
-def test_without_truth_only_what_needs_none_is_told(folder: Path) -> None:
-    log = replace(read_log(folder / "a"), truth=None)
-    found = compare([NamedLog("bare", log)], ["rings"])
+def test_without_truth_only_what_needs_none_is_told(folder: Path, tmp_path: Path) -> None:
+    write_log(replace(read_log(folder / "a"), truth=None), tmp_path / "bare")
+    found = compare(plan_of(tmp_path / "bare", ("rings",)), tmp_path / "cells")
     assert not {"rmse", "missed", "ate", "nees"} & set(found.frame)
     table = tables(found)["table"]
     assert "no true cones" in table.title
-    assert dict(table.rows).keys() == {
-        *(
-            "size",
-            "loop closed at the end of the log [%]",
-            "crossings of the boundaries",
-            "update, mean [ms]",
-        ),
-    }
+    assert [row[0] for row in table.rows] == [
+        *("size", "loop closed at the end of the log [%]", "crossings of the boundaries"),
+        "update, mean [ms]",
+    ]
     assert table.rows[0] == ("size", "32")
     assert {row[0] for row in final_table(found).rows} >= {"size", "map [kB]", "update, mean [ms]"}
 
@@ -198,18 +205,20 @@ def test_side_by_side_has_a_row_per_lap_and_dashes_where_one_has_fewer() -> None
     assert side_by_side({"ours": []}).rows == ()
 
 
-@pytest.mark.slow
 def test_maps_are_drawn_over_one_stretch_with_what_they_reach(folder: Path) -> None:
-    named = read_logs(folder / "a")
-    found = compare(named, ["rings", "broken", "gaps"])
-    figure = plot_maps(found.outcomes, named[0].log)
+    log = read_log(folder / "a")
+    of = {"rings": Rings, "gaps": Gaps}
+    drawn = {
+        name: Drawn(make(MapperSettings(), np.ones(3)).map(), np.zeros((2, 3)), {"rmse": 0.1, "size": 9})
+        for name, make in of.items()
+    }
+    figure = plot_maps(drawn, log.truth)
     used = [axes for axes in figure.axes if axes.get_visible()]
-    assert [axes.get_title(loc="left").split("\n")[0] for axes in used] == ["rings", "gaps"]
+    assert [axes.get_title(loc="left") for axes in used] == [f"{name}\nrmse 0.100 m\nsize 9" for name in of]
     assert used[0].get_xlim() == used[1].get_xlim() and used[0].get_aspect() == 1.0
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     named_labels = [label for label in labels if label]
     assert len(named_labels) == len(set(named_labels))
-    assert {"left boundary", "right landmarks", "true cones"} <= set(labels)
+    assert {"left boundary", "right landmarks", "true cones", "trajectory"} <= set(labels)
     assert figure.get_tightbbox().height <= figure.get_size_inches()[1] <= figure.get_tightbbox().height + 0.4
-    bare = plot_maps(found.outcomes, replace(named[0].log, truth=None))
-    assert bare.axes[0].get_xlim()[1] > 12.0
+    assert plot_maps(drawn, None).axes[0].get_xlim()[1] > 12.0

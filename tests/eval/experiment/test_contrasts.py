@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from pathspace_graph.eval.experiment.frame import contrasts, last_laps
+from pathspace_graph.eval.experiment.frame import RUN, add_batch, contrasts
 from pathspace_graph.eval.experiment.statistics import paired_p
 from pathspace_graph.eval.experiment.study import Baseline, Study
 from pathspace_graph.eval.experiment.tables import (
@@ -56,12 +57,6 @@ def rows(
                     figures = {"rmse": rmse, "missed": 0.0, "size": 80, "ms_mean": 3.0 + by}
                     made.append(shared | {"lap": lap, "failure": ""} | figures)
     return pd.DataFrame(made)
-
-
-def test_the_last_lap_of_each_run_that_finished() -> None:
-    last = last_laps(rows({"default": 0.0, "lag=1": 0.0}, failed=(0, 0)))
-    assert len(last) == 15
-    assert set(last["lap"]) == {2}
 
 
 def test_differences_are_paired() -> None:
@@ -158,14 +153,8 @@ def test_what_is_the_same_and_wall_times_are_not_tested() -> None:
     assert worse.p == pytest.approx(paired_p(np.array(worse.differences))), "it is the only hypothesis"
     frame["ms_mean"] += frame["rmse"]
     assert all(np.isnan(contrast.p) for contrast in contrasts(STUDY, frame, "ms_mean"))
-
-
-def test_the_baseline_can_be_changed_afterwards() -> None:
-    frame = rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0})
-    other = replace(STUDY, baseline=Baseline("lag=1"))
-    first, base, _ = (c for c in contrasts(other, frame, "rmse") if c.noise == "nominal")
-    assert base.difference is None
-    assert first.difference is not None and first.difference.mean == pytest.approx(-0.1, abs=0.02)
+    frame["ms_processor"] = frame["ms_mean"]
+    assert any(contrast.significant for contrast in contrasts(STUDY, frame, "ms_processor"))
 
 
 # --- text and figures ------------------------------------------------------------------------------------
@@ -243,3 +232,33 @@ def test_a_figure_names_settings_without_their_group_where_that_is_enough() -> N
 
     study = replace(STUDY, noise={"nominal": {}}, grids=({"spline.degree": [2], "lag": [1.0]},))
     assert label(study) == "degree=2, lag=1"
+
+
+def row(estimator: str, seed: int = 0, variant: str = "default", **values: float) -> dict[str, Any]:
+    names = {"track": "oval", "seed": seed, "noise": "nominal", "estimator": estimator, "variant": variant}
+    return names | values
+
+
+def test_every_lap_is_compared_with_the_batch_of_its_own_log_and_settings() -> None:
+    rows = [
+        row("fixed-lag", turn=0.003, rmse=0.4),
+        row("fixed-lag", turn=0.002, rmse=0.3),
+        row("spline", turn=0.001, rmse=0.2),
+        row("fixed-lag", seed=1, turn=0.003, rmse=0.4),
+        row("fixed-lag", variant="other", turn=0.003, rmse=0.4),
+        row("spline", variant="other", turn=0.004, rmse=0.4),
+    ]
+    add_batch(rows, (*RUN, "noise", "variant"))
+    found = [(row.get("turn_from_batch"), row.get("rmse_by_batch")) for row in rows]
+    assert found[:2] == [
+        (pytest.approx(0.002), pytest.approx(2.0)),
+        (pytest.approx(0.001), pytest.approx(1.5)),
+    ]
+    assert found[2] == found[3] == found[5] == (None, None)  # the batch itself, and a run without one
+    assert found[4] == (pytest.approx(-0.001), pytest.approx(1.0))
+
+
+def test_a_batch_that_failed_compares_with_nothing() -> None:
+    rows = [row("fixed-lag", turn=0.003, rmse=0.4), row("spline")]
+    add_batch(rows, (*RUN, "noise", "variant"))
+    assert "turn_from_batch" not in rows[0]

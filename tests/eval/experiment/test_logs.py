@@ -79,7 +79,7 @@ def test_simulate_makes_the_drive_of_a_study_to_the_byte(logs: Path, tmp_path: P
     command = ["-q", "simulate", "--track", str(track), "--laps", "1", "--seed", seed]
     assert main([*command, "--out", str(tmp_path / "again")]) == 0
     drive = make_plan(study).cells[0].drive
-    write_log(drive.load(), tmp_path / "drive")
+    write_log(drive.load()[0], tmp_path / "drive")
     assert contents(tmp_path / "again") == contents(tmp_path / "drive")
 
 

@@ -157,15 +157,15 @@ def test_a_worker_of_other_code_stops_the_study(
             forget()
         real(*arguments)
 
-    monkeypatch.setattr("pathspace_graph.eval.experiment.cells.check_code", changed)
-    says = r"plugin: expected the code of \S+ .*plugin_lib.far \w{12}, found plugin_lib.far \w{12} on"
+    monkeypatch.setattr("pathspace_graph.eval.experiment.runner.check_code", changed)
+    says = r"plugin_main: expected the code of \S+ .*plugin_lib.far \w{12}, found plugin_lib.far \w{12} on"
     with pytest.raises(SettingsError, match=says):
         run_study(of, tmp_path / "out")
     assert not [*(tmp_path / "out").glob("cells/*")]
 
 
 def test_a_result_says_where_and_when_it_was_made(tmp_path: Path) -> None:
-    said = made("fixed-lag")
+    said = made("pathspace_graph.online.fixed_lag")
     assert {"gtsam", "numpy", "python", "commit", "host", "processor", "blas", "date"} <= set(said)
     assert said["blas"] and said["processor"] and said["date"].endswith("+00:00")
     frame = run_study(study(tmp_path, estimators=("landmark-ckf",)), tmp_path / "out")

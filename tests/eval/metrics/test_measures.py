@@ -7,12 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.metrics.measures import closes_falsely, measure
+from pathspace_graph.eval.metrics.measures import (
+    WHOLE,
+    closes_falsely,
+    covariance_bytes,
+    map_bytes,
+    measure,
+    stage_times,
+)
 from pathspace_graph.eval.metrics.metric import METRICS, PAPER, Metric
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
-from pathspace_graph.io.map import Map
+from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.spline.bspline import BSpline
 
 from .straight_maps import landmarks, line, row, truth
 
@@ -50,7 +58,7 @@ def run(true: Truth) -> RunResult:
 
 def test_every_lap_has_a_row_and_the_whole_run_is_the_last() -> None:
     true = circle_truth()
-    lap, whole = measure(run(true), log(true), 7.0)
+    lap, whole = measure(run(true), log(true), (7.0, 6.0))
     assert (lap.lap, whole.lap) == (1, None)
     assert (lap.values["closed"], whole.values["closed"], whole.values["closed_at_end"]) == (
         False,
@@ -59,12 +67,13 @@ def test_every_lap_has_a_row_and_the_whole_run_is_the_last() -> None:
     )
     assert [r.values["rmse"] for r in (lap, whole)] == [pytest.approx(0.4), pytest.approx(0.3)]
     assert [r.values["missed"] for r in (lap, whole)] == [0.5, 0.5]  # the right boundary isn't mapped
-    assert (whole.values["size"], whole.values["cones"], whole.values["size_share"]) == (4, 6, 4 / 6)
+    assert (whole.values["size"], whole.values["size_share"]) == (4, 4 / 6)
     assert whole.values["rmse_capped"] == pytest.approx(np.sqrt((0.3**2 + 3.0**2) / 2))
     assert whole.values["mapped_to_truth"] == pytest.approx(0.3, abs=1e-3)
     assert whole.values["truth_to_mapped"] == np.inf
     assert (whole.values["inside"], whole.values["ghost_metres"]) == (0.0, 0.0)
-    assert whole.values["seconds"] == 7.0 and "seconds" not in lap.values
+    assert (whole.values["seconds"], whole.values["seconds_processor"]) == (7.0, 6.0)
+    assert "seconds" not in lap.values
     assert set(whole.values) | set(lap.values) <= set(METRICS)
 
 
@@ -91,29 +100,19 @@ def test_a_batch_has_a_row_of_its_last_lap_and_no_update_times() -> None:
 def test_without_truth_only_what_needs_none_is_measured() -> None:
     true = circle_truth()
     lap, whole = measure(run(true), log(None))
-    keys = {"size", "closed", "bytes", "bytes_covariance", "ms_mean", "ms_p99"}
+    keys = {"size", "closed", "bytes", "bytes_covariance", "ms_mean", "ms_p99", "ms_processor"}
     assert set(lap.values) == keys == set(whole.values) - {"closed_at_end", "crossings"}
     bare = log(Truth(true.pose_t, true.poses, np.zeros((0, 2)), np.zeros(0, dtype=int)))
     assert set(measure(run(true), bare)[0].values) == keys | {"ate", "along", "across"}
 
 
-def test_the_whole_run_may_be_left_with_what_no_lap_has() -> None:
+def test_marginals_are_measured_and_limits_need_associations() -> None:
     true = circle_truth()
-    (lap, whole), (same, bare) = (measure(run(true), log(true), whole=chosen) for chosen in (True, False))
-    assert same == lap
-    assert bare.values == {key: value for key, value in whole.values.items() if METRICS[key].scope == "run"}
-    made = replace(run(true), laps=0, lap_maps=(), snapshots=())
-    assert measure(made, log(None), whole=False) == measure(made, log(None))
-
-
-def test_marginals_and_yardsticks_are_measured_where_they_are_asked_for() -> None:
-    true = circle_truth()
-    (*_, whole) = measure(run(true), log(true), marginals=True)
+    (*_, whole) = measure(run(true), log(true))
     for key in ("inside", "normalized_error"):  # the map's covariance has no cross terms
         assert whole.values[f"{key}_marginals"] == pytest.approx(whole.values[key])
     # 0.3 m by 0.1 m at both ends, and by 0.1 sqrt(20 / 64) m in the middle
     assert whole.values["normalized_error"] == pytest.approx((9.0 + 9.0 + 28.8) / 3)
-    assert whole.values["nees_inside"] is False
     with pytest.raises(ValueError, match="associations"):
         measure(run(true), log(true), reference_limits=True)
 
@@ -124,7 +123,6 @@ def test_landmarks_have_no_band() -> None:
     (*_, whole) = measure(replace(run(true), map=points), log(true))
     assert np.isnan(whole.values["inside"]) and np.isnan(whole.values["normalized_error"])
     assert whole.values["nees"] == pytest.approx(1 / 6)
-    assert whole.values["nees_inside"] is False
 
 
 @pytest.mark.parametrize(
@@ -174,7 +172,11 @@ def test_a_metric_is_shown_in_its_unit() -> None:
     assert METRICS["missed"].heading == "missed [%]" and METRICS["size"].heading == "size"
     assert METRICS["missed"].text(0.125) == "12.5" and METRICS["bytes"].text(1640.0) == "1.64"
     assert Metric("k", "t").text(float("nan")) == "–"
-    assert {key for key, metric in METRICS.items() if metric.time} == {*("ms_mean", "ms_p99", "seconds")}
+    assert {key for key, metric in METRICS.items() if metric.time == "wall"} == {
+        "ms_mean",
+        "ms_p99",
+        "seconds",
+    }
 
 
 # --- what a run says of itself ---------------------------------------------------------------------------
@@ -204,3 +206,25 @@ def test_the_calibration_is_told_in_sigmas_of_its_prior() -> None:
     whole = measure(replace(run(true), vehicle=state, settings=priors), log(true))[-1].values
     assert (whole["scale_by_prior"], whole["bias_by_prior"]) == (pytest.approx(4.0), pytest.approx(-0.5))
     assert "scale_by_prior" not in measure(replace(run(true), vehicle=state), log(true))[-1].values
+
+
+def test_bytes_of_a_map() -> None:
+    closed = BSpline.periodic_from(np.arange(9.0), np.random.default_rng(0).normal(size=(8, 2)))
+    track = Map(True, {LEFT: SplineBoundary(closed, np.eye(16)), RIGHT: landmarks((0, 0), (1, 1), (2, 2))})
+    assert map_bytes(track) == 8 * (16 + 9 + 6)
+    assert covariance_bytes(track) == 8 * (16 * 17 // 2 + 6 * 7 // 2)
+    assert map_bytes(Map(False, {LEFT: line(0.0)})) == 8 * (8 + 8)
+    assert map_bytes(Map(False, {})) == covariance_bytes(Map(False, {})) == 0
+
+
+def test_times_of_cycles_and_their_stages() -> None:
+    cycles = [
+        CycleRecord(k, 0.1 * k, 0.001 * (k + 1), 0, 0, 0, 1, {"predict": 0.0005, **extra})
+        for k, extra in enumerate([{}, {}, {"close": 0.002}])
+    ]
+    whole, predict, close = stage_times(cycles)
+    assert (whole["stage"], predict["stage"], close["stage"]) == (WHOLE, "predict", "close")
+    assert (whole["mean"], whole["median"]) == (pytest.approx(0.002), pytest.approx(0.002))
+    assert whole["p99"] == pytest.approx(0.00298)
+    assert (predict["share"], close["mean"], close["median"]) == (0.25, pytest.approx(0.002 / 3), 0.0)
+    assert stage_times([]) == []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -77,6 +77,7 @@ def test_landmarks_are_measured_to_the_nearest() -> None:
     assert row.rmse == pytest.approx(np.sqrt(0.5))
 
 
+@settings(deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_the_closest_point_is_no_farther_than_any_sample(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -96,8 +97,8 @@ def test_missed_at_a_distance_and_rmse_with_a_missed_cone_as_three_metres() -> N
     at = (0.0, 0.9, 1.5, 2.5, 4.0)
     found = cone_errors(track, truth([*((x, 0.0, LEFT) for x in at), (0.0, 0.0, RIGHT)]))
     assert [found[key] for key in ("missed_1m", "missed_2m", "missed")] == [4 / 6, 3 / 6, 2 / 6]
-    assert (found["cones"], found["size_share"]) == (6, 1 / 6)
+    assert found["size_share"] == 1 / 6
     assert found["rmse_capped"] == pytest.approx(np.sqrt((0.81 + 2.25 + 6.25 + 9 + 9) / 6))
     assert cone_errors(track, truth([(2.0, 0.0, LEFT)]))["missed_2m"] == 0.0
     nothing = cone_errors(track, truth([]))
-    assert nothing.pop("cones") == 0 and np.isnan([*nothing.values()]).all()
+    assert np.isnan([*nothing.values()]).all()

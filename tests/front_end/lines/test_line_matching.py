@@ -6,7 +6,7 @@ import numpy as np
 
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.front_end.front_end import FrontEnd
-from pathspace_graph.front_end.line_matching import match_lines, merged, targets_on_lines
+from pathspace_graph.front_end.line_matching import LineMatch, Seen, merged, targets_on_lines
 from pathspace_graph.front_end.scan_matching import MATCH_LIMITS, REACHES, REACHES_CHECK
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
@@ -40,10 +40,9 @@ def test_walls_tell_the_way_across_and_the_turn_and_nothing_along() -> None:
     """The vehicle is 0.2 m to the left and turned by 0.02 rad; its points are at other places than before."""
     true = np.array([0.0, 0.2, 0.02])
     points = to_vehicle(CORRIDOR + np.array([0.17, 0.0]), np.tile(true, (len(CORRIDOR), 1)))
-    seen = points, np.full(len(points), 0.01), np.ones(len(points), bool)
-    pose, information, matched, square = match_lines(
-        (NO_CONES, CORRIDOR), seen, np.zeros(3), REACHES, MATCH_LIMITS
-    )
+    seen = Seen(points, np.full(len(points), 0.01), np.ones(len(points), bool))
+    match = LineMatch(NO_CONES, CORRIDOR, seen, MATCH_LIMITS)
+    pose, information, matched, square = match.found(np.zeros(3), REACHES)
     np.testing.assert_allclose(pose, true, atol=2e-3)
     sigmas = np.sqrt(np.diag(np.linalg.inv(information)))
     assert sigmas[0] > 1.0
@@ -63,9 +62,9 @@ def test_cones_beside_a_wall_are_matched_with_it() -> None:
     every = np.concatenate([every, [[14.0, 5.0]]])
     points = to_vehicle(every, np.tile(true, (len(every), 1)))
     is_line = np.isin(np.arange(len(every)), np.arange(len(wall)) + len(cones))
-    seen = points, np.full(len(points), 0.01), is_line
-    start = np.array([0.3, 0.0, 0.0])
-    pose, _, matched, _ = match_lines((cones, wall), seen, start, REACHES_CHECK, MATCH_LIMITS)
+    seen = Seen(points, np.full(len(points), 0.01), is_line)
+    match = LineMatch(cones, wall, seen, MATCH_LIMITS)
+    pose, _, matched, _ = match.found(np.array([0.3, 0.0, 0.0]), REACHES_CHECK)
     np.testing.assert_allclose(pose, true, atol=0.02)
     assert matched[:3].all()
     assert not matched[-1]
