@@ -1,9 +1,10 @@
-"""The compiled kernels; everything else is in pyproject.toml.
+"""The compiled kernels, and where the project is published; everything else is in pyproject.toml.
 
 Where no C++ compiler is found, the package `ziglang` is one, which pip installs for the build alone.
 """
 
 import os
+import re
 import shlex
 import shutil
 import sys
@@ -41,6 +42,15 @@ class BuildKernels(build_ext):
         self.spawn([sys.executable, "-m", "ziglang", "c++", *flags, *ext.sources, "-o", str(target)])
 
 
+def readme(repository: str) -> str:
+    """Return the README, whose links lead to the repository (a URL) where one publishes it."""
+    text = Path("README.md").read_text(encoding="utf-8")
+    if repository:
+        text = re.sub(r"(!\[[^]]*\]\()(?!http)", rf"\1{repository}/raw/HEAD/", text)
+        text = re.sub(r"(\]\()(?!http|#)", rf"\1{repository}/blob/HEAD/", text)
+    return text
+
+
 FOLDER = Path("pathspace_graph/factors/kernels")
 KERNELS = Pybind11Extension(
     "pathspace_graph.factors._kernels",
@@ -50,8 +60,14 @@ KERNELS = Pybind11Extension(
     extra_compile_args=["-O3", "-ffp-contract=off"],
 )
 
+REPOSITORY = os.environ.get("REPOSITORY_URL", "")  # set by the workflows
+URLS = {"Source": "", "Issues": "/issues", "Changelog": "/blob/HEAD/CHANGELOG.md"}
+
 ParallelCompile().install()
 setup(
+    long_description=readme(REPOSITORY),
+    long_description_content_type="text/markdown",
+    project_urls={name: REPOSITORY + path for name, path in URLS.items() if REPOSITORY},
     ext_modules=[KERNELS],
     cmdclass={"build_ext": BuildKernels},
     setup_requires=[] if has_compiler() else ["ziglang>=0.13"],

@@ -50,6 +50,10 @@ GROUPS: Final = {
         "report": Command("study.Report", "studies", "measures the figures of the pages"),
     },
 }
+EXTRAS: Final = {  # packages that the core does without, and the extra that has them
+    **dict.fromkeys(("pandas", "tabulate", "matplotlib", "PIL"), "eval"),
+    "distributed": "cluster",
+}
 COMMANDS: Final = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
@@ -65,6 +69,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _run([word for word in words if word not in LEVELS], level)
     except PathspaceError as error:
         return _refuse(str(error), level, NOT_SOLVED if isinstance(error, SolveError) else BAD_INPUT)
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRAS:
+            raise
+        install = f"pip install -e '.[{EXTRAS[error.name]}]'"
+        return _refuse(f"expected the package {error.name} ({install}), found none", level)
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE

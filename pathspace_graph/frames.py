@@ -80,7 +80,7 @@ def to_dataset(study: pd.DataFrame) -> xarray.Dataset:
     attributes. SettingsError if xarray is not installed.
     """
     if find_spec("xarray") is None:
-        raise SettingsError("to_dataset: expected xarray (pip install 'pathspace-graph[frames]'), found none")
+        raise SettingsError("to_dataset: expected xarray (pip install -e '.[frames]'), found none")
     numbers = study.select_dtypes(["number", "bool", "boolean"]).columns.difference(DIMENSIONS, sort=False)
     finished = study[study["lap"].notna()].astype({"lap": "int64", **dict.fromkeys(numbers, "float64")})
     dataset: xarray.Dataset = finished.set_index(list(DIMENSIONS))[list(numbers)].to_xarray()

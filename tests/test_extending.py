@@ -1,9 +1,9 @@
-"""The pages on extending: each code block is run, and does what its page says."""
+"""The examples of the pages on extending do what their page says."""
 
 from __future__ import annotations
 
 import os
-import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -19,7 +19,6 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph import FixedLagMapper, Log, Odometry
-from pathspace_graph.errors import InputError
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.graph.window import WindowFactors
@@ -28,20 +27,17 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim import track_files
 
 from .scenes.drives import exact_log, noisy_lap, replay, true_poses
 from .scenes.jacobians import numeric_jacobian
 from .scenes.paths import ROOT
 from .scenes.pretenders import write_round_track
-from .test_docs import PACKAGE, blocks, csv_rows, eight_seconds, file_blocks, text_of
+from .test_docs import PACKAGE, csv_rows, eight_seconds, file_blocks
 
 Array = NDArray[np.float64]
 
-EXTENDING = ROOT / "docs" / "extending.md"
-ESTIMATORS = ROOT / "docs" / "estimators.md"
-MOST_LINES = 20
-"""Lines of code in a block of the three answers."""
+EXTENDING = ROOT / "examples" / "extending"
+ESTIMATOR = ROOT / "examples" / "dead_reckoning"
 
 
 def module_of(name: str, code: str) -> ModuleType:
@@ -57,21 +53,14 @@ def log() -> Log:
 
 @pytest.fixture
 def page(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
-    """The modules of the page by their names, which import one another."""
+    """The modules of the examples by their names, which import one another."""
 
     def imported(name: str) -> ModuleType:
-        module = module_of(name, file_blocks(EXTENDING)[f"{name}.py"])
+        module = module_of(name, (EXTENDING / f"{name}.py").read_text())
         monkeypatch.setitem(sys.modules, name, module)
         return module
 
     return imported
-
-
-def test_the_three_answers_are_short_and_in_this_order() -> None:
-    headings = re.findall(r"^## (.*)$", text_of(EXTENDING), flags=re.MULTILINE)
-    assert headings == ["A new sensor", "A new factor", "A new phase", "Another part"]
-    for block in blocks(EXTENDING, "python"):
-        assert sum(bool(line) for line in block.splitlines()) <= MOST_LINES
 
 
 # --- a new sensor ----------------------------------------------------------------------------------------
@@ -177,7 +166,7 @@ def test_the_new_rows_keep_a_car_from_slipping(
 
     np.testing.assert_allclose(last_pose(), [25.0, 1.0, 0.0], atol=1e-9)
     page("no_slip")
-    window = module_of("window", file_blocks(EXTENDING)["graph/window.py"])
+    window = module_of("window", file_blocks(ROOT / "docs" / "extending.md")["graph/window.py"])
     monkeypatch.setattr(WindowFactors, "_rows", window._rows)
     np.testing.assert_allclose(last_pose(), [25.0, 0.0, 0.0], atol=0.02)
 
@@ -255,9 +244,8 @@ def test_another_association_uses_what_it_says(log: Log, page: Callable[[str], M
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the page's estimator as pip would install it: the module beside its metadata."""
     folder = tmp_path_factory.mktemp("site")
-    files = file_blocks(ESTIMATORS)
-    (folder / "dead_reckoning.py").write_text(files["dead_reckoning.py"])
-    project = tomllib.loads(files["pyproject.toml"])["project"]
+    shutil.copy(ESTIMATOR / "dead_reckoning.py", folder)
+    project = tomllib.loads((ESTIMATOR / "pyproject.toml").read_text())["project"]
     info = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(
@@ -305,7 +293,7 @@ def test_the_new_estimator_is_compared(installed: Path, log_folder: Path) -> Non
 
 @pytest.mark.slow
 def test_the_new_estimator_is_ablated(installed: Path) -> None:
-    (installed / "study.toml").write_text(file_blocks(ESTIMATORS)["dead_reckoning.toml"])
+    shutil.copy(ESTIMATOR / "dead_reckoning.toml", installed / "study.toml")
     track = write_round_track(installed)
     run_command(installed, f"ablate study.toml --out study --tracks {track} --jobs 1")
     rows = csv_rows(installed / "study" / "results.csv")
@@ -318,31 +306,3 @@ def test_the_new_estimator_is_scaled(installed: Path) -> None:
     run_command(installed, "scale --out scaling --quick --estimators dead-reckoning")
     rows = csv_rows(installed / "scaling" / "points.csv")
     assert {row["estimator"] for row in rows} == {"dead-reckoning"}
-
-
-# --- a new track format ----------------------------------------------------------------------------------
-
-
-def test_the_new_track_format_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    namespace = dict(vars(track_files))
-    exec(compile(file_blocks(ESTIMATORS)["sim/track_files.py"], "estimators.md", "exec"), namespace)
-    line = blocks(ESTIMATORS, "python")[-1]
-    added: tuple[track_files.TrackFormat, ...] = eval(line, namespace)
-    monkeypatch.setattr(track_files, "FORMATS", (*track_files.FORMATS, *added))
-    file = tmp_path / "oval.json"
-    file.write_text(oval())
-    track = track_files.read_track(file)
-    assert len(track.left) == len(track.right) == 30
-    assert track.name == "oval"
-    file.write_text('{"left": [["a", 0]], "right": []}')
-    with pytest.raises(InputError, match=r"left\[0\]\[0\]: expected float, got str"):
-        track_files.read_track(file)
-
-
-def oval() -> str:
-    """A round track in the page's format, driven counterclockwise."""
-    angles = 2.0 * np.pi * np.arange(30) / 30.0
-    left, right = (
-        [[float(radius * np.cos(a)), float(radius * np.sin(a))] for a in angles] for radius in (18.0, 22.0)
-    )
-    return f'{{"left": {left}, "right": {right}, "start": [20.0, 0.0, {np.pi / 2}]}}'

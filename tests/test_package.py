@@ -54,6 +54,8 @@ def package_of(folder: Path) -> str:
 
 def test_the_package_holds_links_to_the_folders_beside_it() -> None:
     """So setuptools, mypy and editors find one ordinary package."""
+    if not (ROOT / LINKS[0]).exists():
+        pytest.skip("an sdist has folders in place of links")
     for name in LINKS:
         link = ROOT / "pathspace_graph" / name
         assert link.is_symlink() and link.resolve() == ROOT / name
@@ -119,6 +121,14 @@ def test_a_package_that_is_not_built_says_what_to_do() -> None:
     code = f"import sys; sys.modules['{kernels}'] = None; import pathspace_graph.factors.se2"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stderr.splitlines()[-1] == f"ImportError: {kernels} is missing: run pip install -e ."
+
+
+def test_a_command_without_its_extra_says_how_to_install_it() -> None:
+    run = "from pathspace_graph.cli import main; sys.exit(main(['compare', 'log', '--out', 'out']))"
+    code = f"import sys; sys.modules['pandas'] = None; {run}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    said = "pathspace-graph: expected the package pandas (pip install -e '.[eval]'), found none\n"
+    assert (done.returncode, done.stderr) == (2, said)
 
 
 def test_the_package_itself_imports_nothing_but_the_standard_library() -> None:
@@ -188,16 +198,25 @@ def straight_log() -> Log:
     return Log(Odometry(t, twist), tuple(cycles), np.array([0.1, 0.1, 0.01]))
 
 
-def test_the_example_of_the_page_on_python_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("page", "log", "printed"),
+    [("README.md", "pathspace-demo/log", ["False"]), ("docs/python.md", "log", [str(LEFT), str(RIGHT)])],
+)
+def test_the_first_example_of_a_page_runs(
+    page: str,
+    log: str,
+    printed: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    example, *_ = blocks("python", (ROOT / "docs" / "python.md").read_text())
+    example = blocks("python", (ROOT / page).read_text())[0]
     assert len(example.strip().splitlines()) <= 12
-    write_log(straight_log(), tmp_path / "log")
+    (tmp_path / log).parent.mkdir(exist_ok=True)
+    write_log(straight_log(), tmp_path / log)
     monkeypatch.chdir(tmp_path)
-    exec(compile(example, "python.md", "exec"), {})
-    printed = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in printed] == [str(LEFT), str(RIGHT)]
+    exec(compile(example, page, "exec"), {})
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == printed
 
 
 def test_the_readme_sets_up_with_one_command_each() -> None:

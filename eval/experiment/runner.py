@@ -205,7 +205,7 @@ def workers(jobs: int = 1, cluster: str | None = None) -> Iterator[None]:
     try:
         from distributed import Client  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise SettingsError("--cluster: expected the extra pathspace-graph[cluster], found none") from error
+        raise SettingsError("--cluster: expected dask (pip install -e '.[cluster]'), found none") from error
     try:
         client = Client(cluster, timeout=CONNECT_SECONDS)
     except (OSError, ValueError) as error:

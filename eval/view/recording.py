@@ -40,7 +40,7 @@ def import_rerun(option: str) -> Any:
         import rerun  # noqa: PLC0415
         import rerun.blueprint  # noqa: PLC0415
     except ImportError as error:
-        install = "pip install 'pathspace-graph[view]'"
+        install = "pip install -e '.[view]'"
         raise SettingsError(f"{option}: expected the package rerun-sdk, found none; {install}") from error
     return rerun
 

@@ -19,7 +19,7 @@ from .messages import MessageError, Points, frame_of, points_of, pose_of, stamp_
 from .recording import Recording, check_clock, rate, twists_between
 from .settings import BagOptions, LabelRule
 
-INSTALL: Final = "pip install 'pathspace-graph[ros]'"  # command that installs the package that reads bags
+INSTALL: Final = "pip install -e '.[ros]'"  # command that installs the package that reads bags
 SUPPORTED: Final = {  # what a message must hold, by the option of its topic
     "--odometry": "a twist, a speed or a pose",
     "--imu": "an angular velocity",

@@ -706,4 +706,4 @@ def test_without_the_package_one_line_says_how_to_install_it(
     bag = written(tmp_path, lambda messages, t: messages.odometry(t, TWIST))
     monkeypatch.setitem(sys.modules, "rosbags", None)
     line = refused(bag, tmp_path / "log", capsys, *TOPICS)
-    assert "pip install 'pathspace-graph[ros]'" in line
+    assert "pip install -e '.[ros]'" in line

@@ -1,8 +1,8 @@
-"""What a notebook shows: short texts, pictures and frames; and the notebook of the pages, cell by cell."""
+"""What a notebook shows: short texts, pictures and frames; and the paper's isolated tests of the gallery."""
 
 from __future__ import annotations
 
-import json
+import runpy
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from pathspace_graph.io.brief import brief
 
 from ..scenes.drives import short_drive
 
-PAGES = Path(__file__).parents[2] / "docs"
+GALLERY = Path(__file__).parents[2] / "docs" / "gallery"
 LONGEST = 400
 """Most characters of a record's text."""
 
@@ -109,46 +109,17 @@ def test_records_are_drawn() -> None:
     assert plt.get_fignums() == []
 
 
-def cells_of(notebook: str) -> list[dict[str, Any]]:
-    """The cells of code of one of the pages."""
-    if not (PAGES / notebook).exists():
-        pytest.skip("there are no pages beside an installed package")
-    cells = json.loads((PAGES / notebook).read_text())["cells"]
-    return [cell for cell in cells if cell["cell_type"] == "code"]
-
-
-def names_of(notebook: str) -> dict[str, Any]:
-    """What a notebook of the pages has defined at its end, with a lap in place of two."""
-    names: dict[str, Any] = {}
-    for cell in cells_of(notebook):
-        source = "".join(cell["source"]).replace("laps=2", "laps=1")
-        exec(compile(source, notebook, "exec"), names)  # the notebook is ours
-    plt.close("all")
-    return names
-
-
-def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert not any(cell["outputs"] for cell in cells_of("notebook.ipynb"))
-    names = names_of("notebook.ipynb")
-    assert names["result"].map.closed
-    assert len(names["growing"]) > 3
-
-
 # --- the paper's isolated tests --------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def isolated() -> dict[str, Any]:
+    if not GALLERY.exists():
+        pytest.skip("there are no pages beside an installed package")
     with mpl.rc_context({"backend": "agg"}):
-        return names_of("isolated.ipynb")
-
-
-def test_a_picture_stands_below_each_isolated_test() -> None:
-    shown = [
-        "image/png" in output["data"] for cell in cells_of("isolated.ipynb") for output in cell["outputs"]
-    ]
-    assert shown == [True] * 4
+        names = runpy.run_path(str(GALLERY / "isolated.py"))
+    plt.close("all")
+    return names
 
 
 def test_the_joint_covariance_is_the_spread_of_splines_and_the_marginals_are_not(
