@@ -98,9 +98,8 @@ def test_a_vehicle_has_driven_beside_all_of_a_boundary() -> None:
     """A quarter of the circle was never driven: the curves only bridge it."""
     driven = circle(20.0)[:45]
     against = objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, driven, USED, SETTINGS)
-    assert against.startswith("a boundary would be ") and against.endswith(
-        " as far from the drive as it is beside it"
-    )
+    assert against.startswith("a boundary has a stretch ")
+    assert against.endswith(" times as far from the drive as where it was driven along")
 
 
 @pytest.mark.parametrize("begin", [0.0, np.pi])
