@@ -66,7 +66,7 @@ def objection(splines: Mapping[int, BSpline], poses: Array, used: float, setting
             known[np.arange(first, last if last >= first else last + len(curve)) % len(curve)] = False
         wider = float(np.max(by_drive.query(curve[known])[0])) / aside
         if wider > DRIVE_RATIO:
-            return f"a boundary has a stretch {wider:.1f} times as far from the drive as where it was driven along"
+            return f"a boundary has a stretch {wider:.1f} times as far from the drive as one driven along"
     if used < settings.batch.closure.used:
         return f"only {used:.0%} of the detections lie on its boundaries".replace("%", " %")
     return ""

@@ -99,7 +99,7 @@ def test_a_vehicle_has_driven_beside_all_of_a_boundary() -> None:
     driven = circle(20.0)[:45]
     against = objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, driven, USED, SETTINGS)
     assert against.startswith("a boundary has a stretch ")
-    assert against.endswith(" times as far from the drive as where it was driven along")
+    assert against.endswith(" times as far from the drive as one driven along")
 
 
 @pytest.mark.parametrize("begin", [0.0, np.pi])
