@@ -1,7 +1,7 @@
 """Simulated cars on generated tracks, as the studies of known and joint maps drive them."""
 
-from collections.abc import Mapping
-from typing import Final
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,3 +19,14 @@ CARS: Final[Mapping[str, SimulationSettings]] = {
 def generated(number: int) -> Track:
     """Return the generated track of a seed."""
     return generate_track(np.random.default_rng(number))
+
+
+def on_tracks(
+    tracks: Sequence[int], cars: Mapping[str, SimulationSettings], **same: Any
+) -> list[dict[str, Any]]:
+    """Return the arguments of a function of each car on each track, with the same others."""
+    return [
+        {"car": car, "track": track, "settings": settings, **same}
+        for track in tracks
+        for car, settings in cars.items()
+    ]

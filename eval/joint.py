@@ -16,7 +16,7 @@ from pathspace_graph.io.moved import moved_run
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from .cars import CARS, generated
+from .cars import CARS, generated, on_tracks
 from .experiment.rows import rows_of
 from .metrics.alignment import shape_rmse
 from .metrics.consistency import consistency_at_cones, map_nees
@@ -42,12 +42,7 @@ class JointStudy:
 
     def measure(self, **how: Any) -> pd.DataFrame:
         """Return a row for each map: car, track, drives in it, `COLUMNS`; `how` is that of `rows_of`."""
-        parts = [
-            {"car": car, "track": track, "settings": settings, "drives": self.drives}
-            for track in self.tracks
-            for car, settings in self.cars.items()
-        ]
-        return rows_of(of_track, parts, **how)
+        return rows_of(of_track, on_tracks(self.tracks, self.cars, drives=self.drives), **how)
 
 
 def of_track(car: str, track: int, settings: SimulationSettings, drives: int) -> list[dict[str, Any]]:

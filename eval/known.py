@@ -19,7 +19,7 @@ from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from .cars import CARS, generated
+from .cars import CARS, generated, on_tracks
 from .experiment.rows import rows_of
 from .metrics.accuracy import lap_metrics
 from .metrics.trajectory import interpolate_poses
@@ -51,12 +51,7 @@ class KnownStudy:
 
     def measure(self, **how: Any) -> pd.DataFrame:
         """Return a row for each drive: car, track, kind, begin, `COLUMNS`; `how` is that of `rows_of`."""
-        parts = [
-            {"car": car, "track": track, "settings": settings, "begins": self.begins}
-            for track in self.tracks
-            for car, settings in self.cars.items()
-        ]
-        return rows_of(of_track, parts, **how)
+        return rows_of(of_track, on_tracks(self.tracks, self.cars, begins=self.begins), **how)
 
 
 def of_track(

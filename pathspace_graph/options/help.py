@@ -50,7 +50,8 @@ def help_of(command: type[Any], program: str, *, full: bool = False) -> str:
 def read_options(command: type[Any], program: str) -> Any:
     """Return the options of a script, or print its help and end."""
     if "--help" in sys.argv:
-        raise SystemExit(print(help_of(command, program, full=True)))
+        print(help_of(command, program, full=True))
+        raise SystemExit(0)
     return parse(command, program, sys.argv[1:])
 
 
