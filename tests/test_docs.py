@@ -195,6 +195,12 @@ def test_references_in_docstrings_exist() -> None:
 
 
 @every_page
+def test_lines_that_include_a_file_are_as_the_site_reads_them(page: Path) -> None:
+    included = re.findall(r"^.*\b8 ?<.*$", text_of(page), flags=re.MULTILINE)
+    assert [line for line in included if not re.fullmatch(r'--8<-- "examples/[\w/]+\.(py|toml)"', line)] == []
+
+
+@every_page
 def test_python_blocks_import_what_exists(page: Path) -> None:
     nodes = [node for block in blocks(page, "python") for node in ast.walk(ast.parse(block))]
     froms = [node for node in nodes if isinstance(node, ast.ImportFrom)]

@@ -13,7 +13,7 @@ from pathspace_graph import FixedLagMapper, run_online
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 
-track = generate_track(np.random.default_rng(11), TrackGeneratorSettings(lap_length=(200, 240), cones=150))
+track = generate_track(np.random.default_rng(11), TrackGeneratorSettings(lap_length=(130, 160), cones=100))
 first = simulate(track, SimulationSettings(laps=1), seed=0)
 known = run_online(first, FixedLagMapper(odometry_sigma=first.odometry_sigma)).map
 known

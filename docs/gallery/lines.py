@@ -15,7 +15,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import preset, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 
-track = generate_track(np.random.default_rng(11), TrackGeneratorSettings(lap_length=(200, 240), cones=150))
+track = generate_track(np.random.default_rng(11), TrackGeneratorSettings(lap_length=(130, 160), cones=100))
 log = simulate(track, replace(preset({"sensor": "line"}), laps=2), seed=0)
 result = run_online(log, make_online("fixed-lag", MapperSettings(), log))
 lap_metrics(result.map, log.truth, lap=2)

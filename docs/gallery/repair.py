@@ -12,7 +12,7 @@ from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 
-track = generate_track(np.random.default_rng(11), TrackGeneratorSettings(lap_length=(200, 240), cones=150))
+track = generate_track(np.random.default_rng(11), TrackGeneratorSettings(lap_length=(130, 160), cones=100))
 faults = Faults(sensor=SensorFaults(blind=20.0, blind_at=0.4))
 log = simulate(track, SimulationSettings(laps=3, faults=faults), seed=0)
 result = run_online(log, FixedLagMapper(odometry_sigma=log.odometry_sigma))
