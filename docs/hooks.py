@@ -1,7 +1,8 @@
-"""A hook of mkdocs that shows the figures of `docs/figures`, which `pathspace-graph report` measures.
+"""Hook of the site's build: figures become tables, lists of names become the API.
 
-A line that is only a link to a table (`figures/NAME.csv`) becomes that table, with the link as its caption.
-One to the folder itself becomes a line with the commits, machines and dates of all tables.
+A line that is only a link to a table of the report (`figures/NAME.csv`) becomes that table with the link as its
+caption. A link to the folder becomes a line with commits, dates and machines. `::: MODULE: NAMES`
+becomes a directive of mkdocstrings for each name.
 """
 
 import csv
@@ -10,12 +11,14 @@ from pathlib import Path
 
 FIGURES = Path(__file__).parent / "figures"
 LINK = re.compile(r"^\[.*\]\(figures/(.*)\)$", flags=re.MULTILINE)
+API = re.compile(r"^::: (\S+): (.*)$", flags=re.MULTILINE)
 
 Rows = list[dict[str, str]]  # figures of a file, by the names of its columns
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Return the text of a page with its tables."""
+    """Insert tables and directives into the text of a page."""
+    markdown = API.sub(lambda api: "\n".join(f"::: {api[1]}.{name}" for name in api[2].split()), markdown)
     return LINK.sub(lambda link: f"{table(read(link[1]))}\n\n*{link[0]}*" if link[1] else made(), markdown)
 
 
@@ -25,7 +28,7 @@ def read(name: str) -> Rows:
 
 
 def table(rows: Rows) -> str:
-    """Return the table of a file in Markdown, with its rows and columns in the order of the file."""
+    """Markdown table of a file, with rows and columns in the order of the file."""
     title = next(iter(rows[0]))
     columns = [*dict.fromkeys(row["column"] for row in rows)]
     lines = [[title, *columns], [":---", *["---:"] * len(columns)]]
@@ -36,11 +39,12 @@ def table(rows: Rows) -> str:
 
 
 def figure(row: dict[str, str]) -> str:
+    """Value with half the width of its interval, such as `0.165 ± 0.036`."""
     return " ± ".join(filter(None, (row["value"], row["half_width"])))
 
 
 def made() -> str:
-    """Return a line with the commits and dates at which all tables were measured, by machine."""
+    """Line with the commits and dates of all tables, by machine."""
     machines = dict[str, set[str]]()
     for row in (row for file in FIGURES.glob("*.csv") for row in read(file.name)):
         machines.setdefault(row["machine"], set()).add(f"{row['date']} at {row['commit']}")

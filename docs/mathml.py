@@ -1,4 +1,4 @@
-"""Hook of the site's build: formulas become MathML, so no page needs a script from another host."""
+"""Hook of the site's build: convert formulas to MathML, so that no page loads a script from another host."""
 
 import html
 import re
@@ -11,5 +11,6 @@ BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', flags=r
 
 
 def on_page_content(text: str, **_: Any) -> str:
+    """Replace the formulas that arithmatex has marked."""
     text = INLINE.sub(lambda found: convert(html.unescape(found[1])), text)
     return BLOCK.sub(lambda found: convert(html.unescape(found[1]), display="block"), text)

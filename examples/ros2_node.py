@@ -2,12 +2,13 @@
 
     python examples/ros2_node.py --ros-args -r odometry:=/odom -r detections:=/cones -p markers:=false
 
-Detections are a PointCloud2 with labels, or with `markers:=true` a MarkerArray. Only `main` needs ROS.
+Detections are a PointCloud2 with labels, or with `markers:=true` a MarkerArray. Only `main` and `publisher` need ROS.
 docs/ros2.md has the topics, frames and QoS.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -98,40 +99,21 @@ def fill_pose(stamped: Any, pose: Array) -> Any:
     return stamped
 
 
-def main() -> None:
-    """Run the node until it is stopped, then write the map to the folder `map`."""
-    import rclpy  # only `main` needs ROS
+def publisher(node: Any, bridge: Bridge) -> Callable[[CycleResult], None]:
+    """Function that publishes map, road ahead and path after a cycle."""
     from geometry_msgs.msg import Point, PoseStamped
-    from nav_msgs.msg import Odometry
     from nav_msgs.msg import Path as PathMessage
-    from rclpy.executors import ExternalShutdownException
-    from rclpy.qos import QoSProfile, ReliabilityPolicy
-    from sensor_msgs.msg import PointCloud2
-    from std_msgs.msg import Header, String
+    from std_msgs.msg import Header
     from visualization_msgs.msg import Marker, MarkerArray
 
-    rclpy.init()
-    node = rclpy.create_node("pathspace_graph")
-    mounting, wait = node.declare_parameter("mounting", [0.0] * 3), node.declare_parameter("wait", 0.0)
-    bridge = Bridge(tuple(mounting.value), wait.value, node.declare_parameter("map", "").value)
-    kind = MarkerArray if node.declare_parameter("markers", False).value else PointCloud2
     to_map, to_ahead = (node.create_publisher(MarkerArray, f"~/{name}", 1) for name in ("map", "ahead"))
     to_path, path = node.create_publisher(PathMessage, "~/path", 1), PathMessage()
-
-    def now() -> float:
-        return float(node.get_clock().now().nanoseconds) * 1e-9
 
     def lines(points: dict[int, Array], header: Any) -> Any:
         markers = [fill_line(Marker(header=header), points[label], label, Point) for label in points]
         return MarkerArray(markers=markers)
 
-    def take_odometry(message: Any) -> None:
-        bridge.stream.take_odometry(message, now())
-
-    def take_detections(message: Any) -> None:
-        result = bridge.update(message, now())
-        if result is None:
-            return
+    def publish(result: CycleResult) -> None:
         stamp, ahead = node.get_clock().now().to_msg(), bridge.mapper.ahead(AHEAD)
         path.header = Header(frame_id="map", stamp=stamp)
         to_map.publish(lines(boundary_points(bridge.mapper.outline()), path.header))
@@ -140,8 +122,37 @@ def main() -> None:
         path.poses.append(fill_pose(PoseStamped(header=path.header), result.pose))
         to_path.publish(path)
 
+    return publish
+
+
+def main() -> None:
+    """Run the node until it is stopped, then write the map to the folder `map`."""
+    import rclpy
+    from nav_msgs.msg import Odometry
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import PointCloud2
+    from std_msgs.msg import String
+    from visualization_msgs.msg import MarkerArray
+
+    rclpy.init()
+    node = rclpy.create_node("pathspace_graph")
+    mounting, wait = node.declare_parameter("mounting", [0.0] * 3), node.declare_parameter("wait", 0.0)
+    bridge = Bridge(tuple(mounting.value), wait.value, node.declare_parameter("map", "").value)
+    kind = MarkerArray if node.declare_parameter("markers", False).value else PointCloud2
+    publish = publisher(node, bridge)
+
+    def now() -> float:
+        return float(node.get_clock().now().nanoseconds) * 1e-9
+
+    def take_detections(message: Any) -> None:
+        result = bridge.update(message, now())
+        if result is not None:
+            publish(result)
+
     deep, short = (QoSProfile(depth=n, reliability=ReliabilityPolicy.BEST_EFFORT) for n in (100, 10))
-    node.create_subscription(Odometry, "odometry", take_odometry, deep)
+    take_odometry = bridge.stream.take_odometry
+    node.create_subscription(Odometry, "odometry", lambda message: take_odometry(message, now()), deep)
     node.create_subscription(kind, "detections", take_detections, short)
     node.create_subscription(String, "~/save", lambda message: bridge.save(Path(message.data)), 1)
     try:

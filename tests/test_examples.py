@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -26,9 +27,23 @@ def example(name: str) -> ModuleType:
 
 
 def test_every_example_has_a_test() -> None:
-    tested = {"gnss", "surveyed_point", "look_at_graph"}
+    tested = {"carmen", "gnss", "surveyed_point", "look_at_graph"}
     tested |= {"ros2_node", "write_bag"}  # in tests/convert, and by the tutorial
     assert {file.stem for file in EXAMPLES.glob("*.py")} == tested
+
+
+def test_a_scan_of_a_carmen_log_gets_the_twist_to_the_next_pose(tmp_path: Path) -> None:
+    """A metre ahead in 8 s, facing along y; the log is driven eight times as fast."""
+    carmen = example("carmen")
+    poses = ("0 0 1.5707963 0", "0 1 1.5707963 8")
+    (tmp_path / "log").write_text(
+        "".join(f"FLASER 2 1.5 2.5 {pose[:-2]} 0 0 0 {pose[-1]}\n" for pose in poses)
+    )
+    first, second = carmen.scans(tmp_path / "log")
+    line = json.loads(carmen.line(first, second))
+    assert line["t"] == 0.0
+    assert line["twist"] == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
+    assert line["scan"]["ranges"] == [1.5, 2.5]
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ result.plot(log=log)
 cycles = result.to_frame()
 figure, axes = plt.subplots(figsize=(7, 2.5), layout="constrained")
 axes.plot(cycles["t"], cycles["size_left"] + cycles["size_right"])
-axes.set(xlabel="t [s]", ylabel="control points")
+_ = axes.set(xlabel="t [s]", ylabel="control points")
 
 # %% [markdown]
 # ## What a planner reads
@@ -47,4 +47,4 @@ figure.colorbar(coloured, ax=where, label="speed [m/s]")
 how.plot(line.arc_length, line.width_left, label="left")
 how.plot(line.arc_length, line.width_right, label="right")
 how.set(xlabel="arc length [m]", ylabel="width [m]")
-how.legend()
+_ = how.legend()

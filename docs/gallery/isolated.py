@@ -69,7 +69,7 @@ below.plot(u, marginals, "--", label="marginals only")
 below.plot(u[::6], sampled[::6], "k.", label="2000 sampled splines")
 below.set(xlabel="parameter [m]", ylabel="sigma across the curve [m]")
 above.legend()
-below.legend()
+_ = below.legend()
 
 
 # %% [markdown]
@@ -138,7 +138,7 @@ figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")
 draw(axes, curve, "C0", "curve of the state")
 draw(axes, fitted, "C4", "curve fitted to the detections", measurement.covariance)
 axes.plot(*readings.T, "o", color="C2", label="detections")
-axes.legend()
+_ = axes.legend()
 
 # %% [markdown]
 # ## Simplification
@@ -166,4 +166,4 @@ for error, name in zip(errors, ("by curvature", "uniform"), strict=True):
     below.plot(100 * error, label=f"{name}: rms {100 * np.sqrt(np.mean(error**2)):.1f} cm")
 below.set(xlabel="along the curve", ylabel="distance from the old one [cm]")
 above.legend()
-below.legend()
+_ = below.legend()

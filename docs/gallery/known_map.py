@@ -2,7 +2,7 @@
 # # A known map
 #
 # The map of one drive is the prior of the next. The vehicle may start anywhere on it; here it starts a third of a lap further on, with
-# other odometry and other noise.
+# other odometry and other noise. Until it is found, its poses are in a frame of its own.
 
 # %%
 from dataclasses import replace

@@ -29,7 +29,7 @@ log.plot()
 mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
 for odometry, detections in list(split_odometry(log))[:120]:
     result = mapper.update(odometry, detections)
-print(result)
+print(f"{result.t:.1f} s: {sum(result.sizes)} control points, {result.health.condition}")
 mapper.map().plot(trajectory=mapper.poses)
 
 # %% [markdown]
@@ -48,7 +48,7 @@ np.round(ahead.curvature, 3)
 
 # %%
 graph, values = mapper.graph(), mapper.values()
-print(graph.size(), "factors,", values.size(), "variables, error", round(graph.error(values), 2))
+print(f"{graph.size()} factors, {values.size()} variables, error {graph.error(values):.2f}")
 covariance = mapper.marginal_covariance([mapper.next_pose_key - 1, mapper.control_keys(LEFT)[-1]])
 sigma = np.sqrt(np.diag(covariance))
 print(np.round(covariance / np.outer(sigma, sigma), 2))
@@ -62,4 +62,4 @@ left = mapper.map().left
 u = np.linspace(*left.spline.domain, 400)
 figure, axes = plt.subplots(figsize=(7, 2.5), layout="constrained")
 axes.plot(u, left.spline.normal_sigma(u, left.covariance))
-axes.set(xlabel="parameter of the left boundary [m]", ylabel="sigma across [m]")
+_ = axes.set(xlabel="parameter of the left boundary [m]", ylabel="sigma across [m]")

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
 
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH, figure_context, save_figures
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH, Picture, figure_context, save_figures
 from pathspace_graph.eval.metrics.metric import (
     HIGHER,
     LATER_LAPS,
@@ -298,7 +298,7 @@ def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
     rows = [i for i in range(len(panels[0])) if any(panel[i].differences for panel in panels)]
     names = [_name(study, panels[0][i]) for i in rows]
     with figure_context():
-        figure = Figure(figsize=(WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
+        figure = Picture(figsize=(WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
         all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
         for axes, panel in zip(all_axes, panels, strict=True):
             _draw_differences(axes, [panel[i] for i in rows])

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rerun.chunk import RrdReader
 
 from pathspace_graph.cli import main
 from pathspace_graph.errors import OutputError, SettingsError
 from pathspace_graph.eval.view import recording as module
-from pathspace_graph.eval.view.recording import DISPLAYS, VEHICLE, check_recording, has_display, recording
+from pathspace_graph.eval.view.recording import DISPLAYS, check_recording, has_display, recording
 from pathspace_graph.io.log import write_log
-from pathspace_graph.run import split_odometry
 
 from ...scenes.drives import ahead, corridor, exact_log
-from ...scenes.paths import ROOT
 
 
 @pytest.fixture
@@ -105,16 +101,3 @@ def test_a_recording_that_fails_leaves_nothing_and_an_earlier_one_is_kept(tmp_pa
         with recording(file):
             pass
     assert {path.name for path in tmp_path.iterdir()} == {"a.rrd", "a.rrd.~1~"}
-
-
-def test_the_loop_of_the_page_records_every_cycle(tmp_path: Path) -> None:
-    page = (ROOT / "docs" / "view.md").read_text(encoding="utf-8")
-    code = re.search(r"^# own_loop\.py\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
-    assert code is not None
-    names: dict[str, Any] = {}
-    exec(compile(code[1], "own_loop.py", "exec"), names)
-    log = exact_log(ahead(8.0, 1.0), *corridor(30.0))
-    mapper = names["drive"](split_odometry(log), tmp_path / "own.rrd")
-    chunks = [chunk for chunk in RrdReader(tmp_path / "own.rrd").stream() if not chunk.is_static]
-    recorded = sum(chunk.num_rows for chunk in chunks if chunk.entity_path == f"/{VEHICLE}")
-    assert recorded == len(log.cycles) == mapper.road.smoother.next_cycle
