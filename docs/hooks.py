@@ -1,7 +1,7 @@
 """Hook of the site's build: figures become tables, lists of names become the API.
 
-A line that is only a link to a table of the report (`figures/NAME.csv`) becomes that table with the link as its
-caption. A link to the folder becomes a line with commits, dates and machines. `::: MODULE: NAMES`
+A line that is only a link to a table of the report (`figures/NAME.csv`) becomes that table with the link as
+its caption. A link to the folder becomes a line with commits, dates and machines. `::: MODULE: NAMES`
 becomes a directive of mkdocstrings for each name.
 """
 

@@ -2,8 +2,8 @@
 
     python examples/ros2_node.py --ros-args -r odometry:=/odom -r detections:=/cones -p markers:=false
 
-Detections are a PointCloud2 with labels, or with `markers:=true` a MarkerArray. Only `main` and `publisher` need ROS.
-docs/ros2.md has the topics, frames and QoS.
+Detections are a PointCloud2 with labels, or with `markers:=true` a MarkerArray.
+Only `main` and `publisher` need ROS; docs/ros2.md has the topics, frames and QoS.
 """
 
 from __future__ import annotations
