@@ -19,7 +19,7 @@ from pathspace_graph.spline.knots import LINEAR_BASELINE, curvature_weighted_bre
 
 
 def posterior(spline, seen, sigma_bend, sigma_anchor, sigma_detection=0.3):
-    """Return the covariance of control points, seen across the curve at parameters and held weakly."""
+    """Covariance of control points, seen across the curve at parameters, with weak priors."""
     across = spline.basis_matrix(seen)[:, :, None] * spline.normal_unit(seen)[:, None, :]
     rows = across.reshape(len(seen), -1) / sigma_detection
     second_differences = smoothness_matrix(greville(spline.knots, spline.degree), None)
@@ -42,8 +42,8 @@ def draw(axes, spline, color, name, covariance=None):
 # %% [markdown]
 # ## Uncertainty
 #
-# Nothing was seen on a stretch of the curve. The joint covariance of its control points, through the basis functions, is the spread of
-# splines that are drawn from it. The sum of squared basis functions leaves the cross terms out, and is not.
+# Nothing was seen on a stretch of the curve. The joint covariance of its control points, through the basis functions, gives the spread of
+# splines that are drawn from it. The sum of squared basis functions does not, as it leaves the cross terms out.
 
 # %%
 x = 5.5 * np.arange(13)
