@@ -8,7 +8,6 @@ from typing import Any, Final, Self
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from rich.table import Table
 from rich.text import Text
 from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
@@ -289,7 +288,7 @@ def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     return as_text(tables, note)
 
 
-def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
+def plot_differences(study: Study, frame: pd.DataFrame) -> Picture | None:
     """Draw pairs, mean and interval of each combination for the first metrics; None where no run differs."""
     every = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
     panels = [p for p in every if any(d != 0.0 for contrast in p for d in contrast.differences)][:MAX_PANELS]

@@ -21,6 +21,7 @@ from pathspace_graph.eval.experiment.tables import (
     plot_differences,
     summary_tables,
 )
+from pathspace_graph.eval.figures.style import Picture
 
 STUDY = Study(
     tracks=(0, 1, 2, 3),
@@ -196,7 +197,7 @@ def test_latex_is_escaped(frame: pd.DataFrame) -> None:
 
 def test_figures_of_what_differs(frame: pd.DataFrame) -> None:
     drawn = plot_differences(STUDY, frame)
-    assert drawn is not None
+    assert isinstance(drawn, Picture)  # which a notebook shows
     (panel,) = drawn.axes
     assert panel.get_title("left") == "rmse [m]"
     assert [label.get_text() for label in panel.get_yticklabels()] == [
