@@ -19,6 +19,7 @@ from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNK
 from pathspace_graph.eval.metrics.summary import has_cones, versions
 from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.map import read_map
+from pathspace_graph.io.overrides import Overrides
 from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory
 from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.settings.mapper import MapperSettings
@@ -48,6 +49,7 @@ def plan_of(
     reference: str | None = None,
     settings: MapperSettings | None = None,
     ghosts: GhostSettings | None = None,
+    own: Overrides | None = None,
 ) -> Plan:
     """Return the plan of every estimator, or those named, on a log or a folder of logs.
 
@@ -65,6 +67,7 @@ def plan_of(
         logs={name: (folder,) for name, folder in log_folders(logs).items()},
         estimators=chosen,
         settings=settings or MapperSettings(),
+        own=own or {},
         baseline=Baseline(estimator=reference or default),
     )
     return make_plan(study, keep=True, ghosts=ghosts)
