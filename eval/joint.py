@@ -18,10 +18,10 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from .cars import CARS, generated, on_tracks
 from .experiment.rows import rows_of
+from .experiment.tables import Quantity, Table
 from .metrics.alignment import shape_rmse
 from .metrics.consistency import consistency_at_cones, map_nees
 from .metrics.trajectory import position_rms, trajectory_errors
-from .views import Figure, View
 
 COLUMNS: Final = {  # of the table: title, digits, factor
     "shape": ("rmse of the shape [m]", 3, 1.0),
@@ -89,7 +89,7 @@ def _truth(log: Log) -> Truth:
     return log.truth
 
 
-def joint_table(frame: pd.DataFrame) -> View:
+def joint_table(frame: pd.DataFrame) -> Table:
     """Return a row for each kind of car and number of drives, over tracks: the maps of one are no sample."""
     rows = []
     for car, of_car in frame.groupby("car", sort=False):
@@ -98,6 +98,6 @@ def joint_table(frame: pd.DataFrame) -> View:
             own = means.loc[count]
             before = means.loc[count // 2]["shape"] if count > 1 else np.nan
             values = own.assign(ratio=own["shape"] / before)
-            figures = (Figure.of(values[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
-            rows.append((f"{car}, {count} drive{'s' if count > 1 else ''}", tuple(figures)))
-    return ("cars, drives of a track", *(title for title, _, _ in COLUMNS.values())), tuple(rows)
+            figures = (Quantity.of(values[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
+            rows.append((f"{car}, {count} drive{'s' if count > 1 else ''}", *figures))
+    return Table(("cars, drives of a track", *(title for title, _, _ in COLUMNS.values())), tuple(rows))

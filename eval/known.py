@@ -21,9 +21,9 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from .cars import CARS, generated, on_tracks
 from .experiment.rows import rows_of
+from .experiment.tables import Quantity, Table
 from .metrics.accuracy import lap_metrics
 from .metrics.trajectory import interpolate_poses
-from .views import Figure, View
 
 OWN, SURVEYED, MOVED, OTHER = "another drive's", "surveyed", "surveyed, 7 cones moved", "another track's"
 KINDS: Final = (OWN, SURVEYED, MOVED, OTHER)  # of known maps
@@ -138,13 +138,13 @@ def motion_onto(points: Array, onto: Array) -> Array:
     return np.array([goal[0] - turned.real, goal[1] - turned.imag, turn])
 
 
-def known_table(frame: pd.DataFrame) -> View:
+def known_table(frame: pd.DataFrame) -> Table:
     """Return a row for each car and kind of map, over tracks: the drives of one are no sample."""
     rows = []
     for car, of_car in frame.groupby("car", sort=False):
         for kind in KINDS:
             drives = of_car[of_car["kind"] == kind]
             means = drives.groupby("track")[[*COLUMNS]].mean()
-            figures = (Figure.of(means[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
-            rows.append((f"{car}, {kind} ({len(drives)} drives)", tuple(figures)))
-    return ("cars, known map", *(title for title, _, _ in COLUMNS.values())), tuple(rows)
+            figures = (Quantity.of(means[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
+            rows.append((f"{car}, {kind} ({len(drives)} drives)", *figures))
+    return Table(("cars, known map", *(title for title, _, _ in COLUMNS.values())), tuple(rows))
