@@ -11,7 +11,7 @@ from pathspace_graph.batch.joint_mapper import join
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.estimators import DEFAULT_BATCH, make_batch
 from pathspace_graph.factors.se2 import inverse
-from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.log import Log
 from pathspace_graph.io.moved import moved_run
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -21,6 +21,7 @@ from .experiment.rows import rows_of
 from .experiment.tables import Quantity, Table
 from .metrics.alignment import shape_rmse
 from .metrics.consistency import consistency_at_cones, map_nees
+from .metrics.reference import truth_of
 from .metrics.trajectory import position_rms, trajectory_errors
 
 COLUMNS: Final = {  # of the table: title, digits, factor
@@ -73,7 +74,7 @@ def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) 
         joint = join(mapped)
         first, mapped = next(iter(joint.drives)), joint.drives
         own = {name: moved_run(drive, inverse(joint.frames[name])) for name, drive in mapped.items()}
-    track, truths = mapped[first].map, {name: _truth(logs[name]) for name in mapped}
+    track, truths = mapped[first].map, {name: truth_of(logs[name]) for name in mapped}
     errors = [trajectory_errors(own[name].trajectory_t, own[name].trajectory, truths[name]) for name in own]
     return {
         "shape": shape_rmse(track, truths[first]),
@@ -82,11 +83,6 @@ def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) 
         "ate": float(np.mean([position_rms(one) for one in errors])),
         "mapped": len(own),
     }
-
-
-def _truth(log: Log) -> Truth:
-    assert log.truth is not None
-    return log.truth
 
 
 def joint_table(frame: pd.DataFrame) -> Table:

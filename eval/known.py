@@ -23,6 +23,8 @@ from .cars import CARS, generated, on_tracks
 from .experiment.rows import rows_of
 from .experiment.tables import Quantity, Table
 from .metrics.accuracy import lap_metrics
+from .metrics.reference import truth_of
+from .metrics.registration import motion_onto
 from .metrics.trajectory import interpolate_poses
 
 OWN, SURVEYED, MOVED, OTHER = "another drive's", "surveyed", "surveyed, 7 cones moved", "another track's"
@@ -77,11 +79,6 @@ def of_track(
     return rows
 
 
-def truth_of(log: Log) -> Truth:
-    assert log.truth is not None
-    return log.truth
-
-
 def mapped(log: Log) -> Map:
     """Return the online map of a drive."""
     return run_online(log, make_online(DEFAULT_ONLINE, MapperSettings(), log), name=DEFAULT_ONLINE).map
@@ -127,15 +124,6 @@ def drive_on(known: Map, log: Log, share: float, motion: Array) -> dict[str, Any
         "wrong": float(is_wrong),
         "error": float(np.sqrt(np.mean(away**2))),
     }
-
-
-def motion_onto(points: Array, onto: Array) -> Array:
-    """Return the motion (3,) that leads points (n, 2) onto others, by least squares (Umeyama 1991)."""
-    middle, goal = points.mean(axis=0), onto.mean(axis=0)
-    a, b = (points - middle) @ [1.0, 1j], (onto - goal) @ [1.0, 1j]
-    turn = float(np.angle(np.vdot(a, b)))
-    turned = complex(*middle) * np.exp(1j * turn)
-    return np.array([goal[0] - turned.real, goal[1] - turned.imag, turn])
 
 
 def known_table(frame: pd.DataFrame) -> Table:

@@ -185,7 +185,7 @@ def plot_scaling(scaling: Scaling) -> Figure:
                     last = scaling.of(sweep, name).iloc[-1]
                     axes.plot(last["at"], 1e3 * last["seconds"], "x", color=color, markersize=10.8)
             axes.set_xscale("log")
-        cones.set_ylabel("mean update (ms)")
+        cones.set_ylabel("mean update [ms]")
         ticks = [n for n in (50, 100, 200, 500, 1000, 2000) if n <= scaling.settings.cones_max]
         for axes, labelled in ((cones, ticks), (detections, scaling.settings.readings)):
             axes.xaxis.set_major_locator(FixedLocator(labelled))
@@ -201,7 +201,7 @@ def plot_laps(scaling: Scaling) -> Figure:
         figure = Figure(figsize=(WIDTH / 2, _HEIGHT), layout="constrained")
         axes = figure.subplots()
         _draw_sweep(axes, scaling, LAPS, linestyle="-")
-        axes.set_ylabel("mean update (ms)")
+        axes.set_ylabel("mean update [ms]")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         style.shared_legend(figure, columns=2)
     return figure
