@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from functools import cache, partial
 from importlib import import_module
-from itertools import chain, takewhile
+from itertools import chain, product, takewhile
 from operator import attrgetter
 from pathlib import Path
 from types import CodeType, FrameType
@@ -367,7 +367,7 @@ def test_the_figures_of_the_readme_are_those_of_the_files(hooks: Any) -> None:
 
     ours, theirs = (row_of("accuracy_estimators", name) for name in ("fixed-lag", "landmark-fixed-lag"))
     compared = ("rmse [m]", "missed [%]", "size", "trajectory error (ATE) [m]")
-    pairs = [(ours[name], theirs[name]) for name in compared]
+    pairs: list[tuple[str, ...]] = [(ours[name], theirs[name]) for name in compared]
     for row in (
         row_of("accuracy_laps", "1"),
         row_of("accuracy_metrics", "curve distance, mapped to truth [m]"),
@@ -375,6 +375,10 @@ def test_the_figures_of_the_readme_are_those_of_the_files(hooks: Any) -> None:
         pairs.append((row["fixed-lag"], row["landmark-fixed-lag"]))
     isam2 = row_of("speed", "mean update relative to iSAM2 with known data association")["measured"]
     known = row_of("known", "drawn, another drive's (24 drives)")
+    for estimator, variant in product(("fixed-lag", "spline"), ("default", "pure projection")):
+        row = row_of("ablation", f"{estimator}, {variant}")
+        shown = (row["rmse [m]"], row["difference"], row["trajectory error (ATE) [m]"])
+        pairs.append(tuple(filter(None, shown)))
     readme = text_of(ROOT / "README.md")
     quoted = re.findall(r"[\d.]+ ± [\d.]+", readme)
     assert quoted == [isam2, known["pose error [m]"], *chain.from_iterable(pairs)]
