@@ -225,7 +225,7 @@ def results_table(
     columns = [contrasts(study, frame, metric.key) for metric in shown]
     rows = []
     for of_row in zip(*columns, strict=True):
-        means = (_mean(metric, one.value) for metric, one in zip(shown, of_row, strict=True))
+        means = (_mean(METRICS[one.metric], one.value) for one in of_row)
         best = (_is_best(one, column) for one, column in zip(of_row, columns, strict=True))
         cells = (replace(mean, is_best=is_best) for mean, is_best in zip(means, best, strict=True))
         rows.append((*(getattr(of_row[0], name) for name in several), *cells))
@@ -239,10 +239,10 @@ def _mean(metric: Metric, of: Estimate, sign: str = "") -> Quantity:
 
 
 def _is_best(one: Contrast, column: Sequence[Contrast]) -> bool:
-    """Whether the mean of a combination is the best of several of its noise."""
+    """Whether the mean of a combination is the best of those of its noise, where they differ."""
     sign = (one.metric in LOWER) - (one.metric in HIGHER)
     means = [sign * of.value.mean for of in column if of.noise == one.noise and of.value.count]
-    return bool(sign and len(means) > 1) and sign * one.value.mean <= min(means)
+    return bool(sign and len(set(means)) > 1) and sign * one.value.mean <= min(means)
 
 
 def _about(study: Study) -> str:
