@@ -21,7 +21,7 @@ from pathspace_graph.eval.benchmark.lanes import CONES, LAPS, READINGS, fit_slop
 from pathspace_graph.eval.benchmark.scaling import Scaling
 from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.experiment.compare import Comparison, compare, plan_of
-from pathspace_graph.eval.experiment.tables import TextTable
+from pathspace_graph.eval.experiment.tables import Table
 from pathspace_graph.eval.metrics.measures import Row
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.log import Log, read_log, write_log
@@ -88,7 +88,7 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
         "commands.compare.simulate": recorded.log,
         "commands.compare.map_with_both": (recorded.result, recorded.result),
         "commands.compare.plot_map": picture,
-        "commands.compare.side_by_side": TextTable("", (), ()),
+        "commands.compare.side_by_side": Table((), ()),
         "commands.estimate.map_online": recorded.result,
         "commands.estimate.report": None,
         "commands.plot.plot_map": picture,
@@ -97,7 +97,7 @@ def quick(recorded: Recorded, comparison: Comparison, monkeypatch: pytest.Monkey
         "commands.studies.make_drives": Roads(),
         "commands.studies.measure_scaling": scaling(),
         "eval.experiment.compare.plot_maps": picture,
-        "eval.experiment.compare.tables": {"table": TextTable("", ("a",), (("1",),))},
+        "eval.experiment.compare.tables": {"table": Table(("a",), (("1",),))},
         "eval.benchmark.scaling.plot_laps": picture,
         "eval.benchmark.scaling.plot_scaling": picture,
         "eval.benchmark.scaling._process_megabytes": 1.0,
