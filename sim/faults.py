@@ -7,9 +7,10 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from pathspace_graph.errors import SettingsError, check_numbers
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.settings.checked import AtLeast0, Checked, Share, Signed
 
 from .curves import FloatArray, IntArray, arc_lengths
 from .sensor import OdometryNoise, measure_twists
@@ -18,89 +19,77 @@ from .vehicle import Drive
 
 
 @dataclass(frozen=True)
-class SensorFaults:
+class SensorFaults(Checked, group="faults.sensor"):
     """A cone detector that is late, badly mounted, badly scaled, colour-blind or out of order."""
 
-    latency: float = 0.0
+    latency: Signed = 0.0
     """Age of the detections at their stamps (s), negative where they are newer."""
-    yaw: float = 0.0
+    yaw: Signed = 0.0
     """Turn of the sensor to the left that its detections don't account for (rad)."""
-    lateral: float = 0.0
+    lateral: Signed = 0.0
     """Offset of the sensor to the left of where its detections assume it (m)."""
-    range_scale: float = 0.0
+    range_scale: Signed = 0.0
     """Share by which each range is too long (-)."""
-    range_bias: float = 0.0
+    range_bias: Signed = 0.0
     """Length by which each range is too long (m)."""
-    colourless: float = 0.0
+    colourless: Share = 0.0
     """Share of the detections without a colour, drawn one by one."""
-    dropout: float = 0.0
+    dropout: AtLeast0 = 0.0
     """Time for which nothing is detected (s)."""
-    dropout_at: float = 0.5
+    dropout_at: AtLeast0 = 0.5
     """Laps after which the dropout begins."""
-    blind: float = 0.0
+    blind: AtLeast0 = 0.0
     """Length of the stretch on which the cones of one side aren't detected (m)."""
-    blind_at: float = 0.5
+    blind_at: AtLeast0 = 0.5
     """Laps after which that stretch begins."""
     blind_side: Literal["left", "right"] = "left"
     """Side whose cones aren't detected there."""
 
     def __post_init__(self) -> None:
-        at_least_0 = ("dropout", "dropout_at", "blind", "blind_at")
-        check_numbers(self, "faults.sensor", at_least_0, "a number of at least 0")
-        check_numbers(self, "faults.sensor", ("colourless",), "a number in [0, 1]")
-        check_numbers(self, "faults.sensor", ("latency", "yaw", "lateral", "range_bias"), "a number")
-        if not -1.0 < self.range_scale < np.inf:
+        super().__post_init__()
+        if self.range_scale <= -1.0:
             raise SettingsError(f"faults.sensor.range_scale: expected more than -1, found {self.range_scale}")
 
 
 @dataclass(frozen=True)
-class OdometryFaults:
+class OdometryFaults(Checked, group="faults.odometry"):
     """Odometry with a biased yaw rate, slipping wheels, or readings that fail."""
 
-    yaw_rate_bias: float = 0.0
+    yaw_rate_bias: Signed = 0.0
     """Bias of the yaw rate beside the drawn one (rad/s)."""
-    speed_scale: float = field(default=0.0, repr=False)
+    speed_scale: Signed = field(default=0.0, repr=False)
     """Share by which the speeds are too large, beside the drawn scale (-)."""
-    slip: float = 0.0
+    slip: Signed = 0.0
     """Share by which the speeds are too large while the wheels slip (-)."""
-    slip_time: float = 1.0
+    slip_time: AtLeast0 = 1.0
     """Time for which the wheels slip (s)."""
     slip_every: float = 8.0
     """Time from one slip to the next, and to the first (s)."""
-    zero: float = 0.0
+    zero: AtLeast0 = 0.0
     """Time for which the measured twists are zero (s)."""
-    zero_at: float = 0.5
+    zero_at: AtLeast0 = 0.5
     """Laps after which the zeros begin."""
-    gap: float = 0.0
+    gap: AtLeast0 = 0.0
     """Time without a measured twist, so that the last one before is held (s)."""
-    gap_at: float = 0.5
+    gap_at: AtLeast0 = 0.5
     """Laps after which the gap begins."""
-    false_travel: float = field(default=0.0, repr=False)
+    false_travel: AtLeast0 = field(default=0.0, repr=False)
     """Speed (m/s) below which the odometry doesn't fall while the vehicle brakes to its last stand."""
-    false_travel_time: float = field(default=3.0, repr=False)
+    false_travel_time: AtLeast0 = field(default=3.0, repr=False)
     """Time for which it goes on so while the vehicle stands (s)."""
-
-    def __post_init__(self) -> None:
-        at_least_0 = ("slip_time", "zero", "zero_at", "gap", "gap_at", "false_travel", "false_travel_time")
-        check_numbers(self, "faults.odometry", at_least_0, "a number of at least 0")
-        check_numbers(self, "faults.odometry", ("slip_every",), "a positive number")
-        check_numbers(self, "faults.odometry", ("yaw_rate_bias", "speed_scale", "slip"), "a number")
 
 
 @dataclass(frozen=True)
-class VehicleFaults:
+class VehicleFaults(Checked, group="faults.vehicle"):
     """A vehicle that is put down elsewhere, or that drives the other way round."""
 
-    put_down: float = 0.0
+    put_down: AtLeast0 = 0.0
     """Distance along the track by which the vehicle is carried, unknown to the odometry (m)."""
-    put_down_at: float = 1.5
+    put_down_at: AtLeast0 = 1.5
     """Laps after which the vehicle is carried."""
     wrong_way: bool = False
     """Whether a closed track is driven the other way round, so that the blue cones are on the right. The
     truth calls the boundary on the left of the way driven the left one."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self, "faults.vehicle", ("put_down", "put_down_at"), "a number of at least 0")
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import numpy as np
 import scipy  # which imports its modules when they are used
 from numpy.random import Generator
 
-from pathspace_graph.errors import SettingsError, check_numbers
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.settings.checked import AT_LEAST_0, AtLeast0, Checked
 
 from .curves import STEP, FloatArray, IntArray, arc_lengths, direction, left_normals, ring, unit
 from .sensor import SensorSettings, false_positives, polar_detections, seen_from
@@ -24,21 +25,17 @@ TRUE_SPACING: Final = 1.0  # greatest distance of the points of a true boundary 
 
 
 @dataclass(frozen=True)
-class LineSettings:
+class LineSettings(Checked, group="line"):
     """Which points of the boundaries a sensor of lines sees."""
 
-    spacing: float = field(default=0.0, repr=False)
+    spacing: AtLeast0 = field(default=0.0, repr=False)
     """Mean distance of a cycle's points along each boundary (m); with 0 the sensor detects cones instead."""
-    sigma_across: float = field(default=0.0, repr=False)
+    sigma_across: AtLeast0 = field(default=0.0, repr=False)
     """Standard deviation of a point across its boundary beside the noise of range and bearing (m)."""
-    gaps: int = field(default=0, repr=False)
+    gaps: Annotated[int, AT_LEAST_0] = field(default=0, repr=False)
     """Number of stretches of a boundary in which nothing is detected, drawn once for a log."""
-    gap_length: float = field(default=10.0, repr=False)
+    gap_length: AtLeast0 = field(default=10.0, repr=False)
     """Length of each of them (m)."""
-
-    def __post_init__(self) -> None:
-        names = ("spacing", "sigma_across", "gaps", "gap_length")
-        check_numbers(self, "line", names, "a number of at least 0")
 
 
 LINE: Final = SensorSettings(

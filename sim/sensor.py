@@ -1,15 +1,16 @@
 """The vehicle's sensors: noisy odometry, and a detector of cones."""
 
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 import scipy  # which imports its modules when they are used
 from numpy.random import Generator
 
-from pathspace_graph.errors import SettingsError, check_numbers
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Detections, polar_covariances
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.settings.checked import AT_LEAST_0, POSITIVE, AtLeast0, Checked, Share, Signed
 
 from .curves import BoolArray, FloatArray, IntArray
 
@@ -18,27 +19,19 @@ CAMERAS: Final = 2  # cameras that may see a cone at once
 
 
 @dataclass(frozen=True)
-class OdometryNoise:
+class OdometryNoise(Checked, group="odometry"):
     """Errors of the measured twist."""
 
-    white: tuple[float, float, float] = (0.25, 0.12, 0.035)
+    white: Annotated[tuple[float, float, float], POSITIVE] = (0.25, 0.12, 0.035)
     """Standard deviations of [vx, vy, wz], white from sample to sample (m/s, m/s, rad/s)."""
-    scale: float = 0.004
+    scale: AtLeast0 = 0.004
     """Standard deviation of the scale error of vx and vy, drawn once for a log (-)."""
-    gyro_bias: float = 0.0015
+    gyro_bias: AtLeast0 = 0.0015
     """Standard deviation of the bias of wz, drawn once for a log (rad/s)."""
-    slow: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), repr=False)
+    slow: Annotated[tuple[float, float, float], AT_LEAST_0] = field(default=(0.0, 0.0, 0.0), repr=False)
     """Standard deviations of the slow errors of [vx, vy, wz] beside the white noise (m/s, m/s, rad/s)."""
     slow_time: float = field(default=5.0, repr=False)
     """Correlation time of the slow errors (s)."""
-
-    def __post_init__(self) -> None:
-        if len(self.white) != 3 or not all(0 < sigma < np.inf for sigma in self.white):
-            raise SettingsError(f"odometry.white: expected three positive numbers, found {self.white}")
-        if len(self.slow) != 3 or not all(0 <= sigma < np.inf for sigma in self.slow):
-            raise SettingsError(f"odometry.slow: expected three numbers of at least 0, found {self.slow}")
-        check_numbers(self, "odometry", ("scale", "gyro_bias"), "a number of at least 0")
-        check_numbers(self, "odometry", ("slow_time",), "a positive number")
 
     def drift_sigmas(self, dt: float) -> FloatArray:
         """Return the standard deviations (3,) of white noise that drifts as much, `dt` s apart.
@@ -50,32 +43,32 @@ class OdometryNoise:
 
 
 @dataclass(frozen=True)
-class SensorSettings:
+class SensorSettings(Checked):
     """What the sensor sees, and its errors."""
 
     rate: float = 10.0
     """Perception cycles per second (Hz)."""
     range_max: float = 15.0
     """Greatest true range of a detection (m)."""
-    range_min: float = 0.5
+    range_min: AtLeast0 = 0.5
     """Least true range of a detection (m)."""
     fov: float = float(np.deg2rad(110.0))
     """Field of view, the whole angle (rad)."""
     range_sigma: float = 0.05
     """Standard deviation of the range at range 0 (m)."""
-    range_sigma_growth: float = 0.012
+    range_sigma_growth: AtLeast0 = 0.012
     """Growth of that standard deviation with the range (m/m)."""
     bearing_sigma: float = float(np.deg2rad(0.9))
     """Standard deviation of the bearing (rad)."""
-    detection_probability: float = 0.98
+    detection_probability: Share = 0.98
     """Probability that a cone in the field of view is detected at range 0."""
-    detection_falloff: float = 0.01
+    detection_falloff: AtLeast0 = 0.01
     """Decrease of the probability of detection with the range (1/m)."""
-    blind_fraction: float = 0.05
+    blind_fraction: Share = 0.05
     """Share of the cones that are never detected, drawn once for a log."""
-    wrong_colour: float = 0.01
+    wrong_colour: Share = 0.01
     """Probability that a detected boundary cone has the other boundary's label."""
-    false_positives: float = 0.03
+    false_positives: AtLeast0 = 0.03
     """Expected number of detections of nothing in a cycle."""
     range_bias: bool = False
     """Whether ranges have a systematic error, as those of cameras do."""
@@ -83,38 +76,31 @@ class SensorSettings:
     """Increasing ranges of the given systematic errors (m), which are linear between them."""
     range_bias_values: tuple[float, ...] = (0.02, 0.34)
     """Systematic errors at those ranges (m), typical of cameras."""
-    range_bend: float = field(default=0.0, repr=False)
+    range_bend: Signed = field(default=0.0, repr=False)
     """Bend k of the ranges (1/m): a range r reads `k (r - range_bend_from)^2` longer beyond that range."""
-    range_bend_from: float = field(default=9.0, repr=False)
+    range_bend_from: AtLeast0 = field(default=9.0, repr=False)
     """Range from which on ranges bend (m)."""
-    slow_range: float = field(default=0.0, repr=False)
+    slow_range: Share = field(default=0.0, repr=False)
     """Share of a range's variance in the slow error of its cone (-)."""
-    slow_bearing: float = field(default=0.0, repr=False)
+    slow_bearing: Share = field(default=0.0, repr=False)
     """Share of a bearing's variance in the slow error of its cone (-)."""
     slow_time: float = field(default=5.0, repr=False)
     """Correlation time of the slow errors of a cone (s)."""
-    duplicates: float = field(default=0.0, repr=False)
+    duplicates: Share = field(default=0.0, repr=False)
     """Probability that a second camera detects a detected cone of the overlap too, with its own errors."""
     overlap: tuple[float, float] = field(default=(0.0, float(np.pi)), repr=False)
     """Least and greatest bearing of the overlap, on both sides (rad)."""
-    dropped_cycles: float = field(default=0.0, repr=False)
+    dropped_cycles: Share = field(default=0.0, repr=False)
     """Share of the cycles in which nothing is detected."""
 
     def __post_init__(self) -> None:
-        positive = ("rate", "range_max", "bearing_sigma", "range_sigma", "fov", "slow_time")
-        check_numbers(self, "sensor", positive, "a positive number")
-        at_least_0 = ("range_min", "range_sigma_growth", "detection_falloff", "false_positives")
-        check_numbers(self, "sensor", at_least_0, "a number of at least 0")
+        super().__post_init__()
         if self.fov > 2 * np.pi or self.range_min >= self.range_max:
             raise SettingsError("sensor: expected fov <= 2 pi rad and range_min < range_max")
-        check_numbers(self, "sensor", ("range_bend",), "a number")
-        check_numbers(self, "sensor", ("range_bend_from",), "a number of at least 0")
         if 1.0 + 2.0 * self.range_bend * max(self.range_max - self.range_bend_from, 0.0) <= 0.0:
             raise SettingsError(
                 f"sensor.range_bend: expected farther cones to read farther, found {self.range_bend}"
             )
-        shares = ("detection_probability", "blind_fraction", "wrong_colour", "duplicates", "dropped_cycles")
-        check_numbers(self, "sensor", (*shares, "slow_range", "slow_bearing"), "a number in [0, 1]")
         least, greatest = self.overlap
         if not 0.0 <= least < greatest:
             raise SettingsError(f"sensor.overlap: expected 0 <= least < greatest, found {self.overlap}")

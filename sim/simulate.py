@@ -12,6 +12,7 @@ from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.io.log import SENSOR, Detections, Log, SensorInfo, Truth, without_stated_noise
 from pathspace_graph.labels import NAMES, UNKNOWN
 from pathspace_graph.lengths import scaled
+from pathspace_graph.settings.checked import Checked
 
 from .cameras import CAMERA, CAMERA_FAULTS, INS, INS_RATE, DrawnCar, draw_car
 from .curves import FloatArray, IntArray
@@ -32,7 +33,7 @@ from .vehicle import Drive, VehicleSettings, displacements, drive
 
 
 @dataclass(frozen=True)
-class SimulationSettings:
+class SimulationSettings(Checked, group=""):
     """A simulated drive."""
 
     laps: int = 5
@@ -50,14 +51,11 @@ class SimulationSettings:
     The log states nothing of their noise. Of those only the vehicle's overrun can be set beside it."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.draw:
             self._check_draw()
-        if self.laps < 1:
-            raise SettingsError(f"laps: expected at least 1, found {self.laps}")
         if self.faults.odometry.false_travel and not self.vehicle.stand:
             raise SettingsError("faults.odometry.false_travel: expected vehicle.stand above 0, found 0")
-        if not 0.0 < self.scale < np.inf:
-            raise SettingsError(f"scale: expected a positive number, found {self.scale}")
 
     def _check_draw(self) -> None:
         """Raise SettingsError where a group that is drawn is neither the default nor a preset."""

@@ -9,6 +9,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.settings.checked import AtLeast0, Checked
 
 from . import curves
 from .curves import FloatArray, arc_lengths, left_normals, ring, unit
@@ -28,7 +29,7 @@ CHICANE_PROBABILITY: Final = 0.3  # that it becomes a chicane
 
 
 @dataclass(frozen=True)
-class TrackGeneratorSettings:
+class TrackGeneratorSettings(Checked, group="generator"):
     """Rules that a generated track keeps."""
 
     lap_length: tuple[float, float] = (220.0, 400.0)
@@ -37,7 +38,7 @@ class TrackGeneratorSettings:
     """Least and greatest distance of the boundaries, constant along a track (m); the rules ask for 3."""
     cones: int = 200
     """Cones of both boundaries together, as nearly as the gaps allow."""
-    separation: float = 1.5
+    separation: AtLeast0 = 1.5
     """Least distance of boundaries of different stretches (m)."""
     corners: tuple[int, int] = (5, 9)
     """Least and greatest number of corners of the layout that the elements are put into."""
@@ -45,6 +46,7 @@ class TrackGeneratorSettings:
     """Least and greatest number of hairpins put into the layout, whose corners may be hairpins as well."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("lap_length", "width", "corners", "hairpins"):
             low, high = getattr(self, name)
             if not 0 <= low <= high:

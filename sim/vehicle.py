@@ -9,7 +9,8 @@ import numpy as np
 import scipy  # which imports its modules when they are used
 from numpy.random import Generator
 
-from pathspace_graph.errors import SettingsError, check_numbers
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.settings.checked import AtLeast0, Checked, Signed
 
 from .curves import CentreLine, FloatArray, arc_lengths, curvature, direction, left_normals
 from .track import Track
@@ -23,12 +24,12 @@ MIN_PATH: Final = 10  # least number of samples of a path
 
 
 @dataclass(frozen=True)
-class VehicleSettings:
+class VehicleSettings(Checked):
     """How the vehicle drives."""
 
     speed_max: float = 12.0
     """Greatest speed (m/s)."""
-    speed_start: float = 0.0
+    speed_start: AtLeast0 = 0.0
     """Speed at the start pose (m/s)."""
     acceleration_lateral: float = 5.0
     """Greatest lateral acceleration (m/s^2), which limits the speed in corners."""
@@ -36,31 +37,27 @@ class VehicleSettings:
     """Greatest longitudinal acceleration (m/s^2)."""
     deceleration: float = 4.0
     """Greatest longitudinal deceleration (m/s^2)."""
-    wander: float = 0.3
+    wander: AtLeast0 = 0.3
     """Largest distance of the smooth lateral wander from the middle (m)."""
     wander_wavelengths: tuple[float, float] = (15.0, 60.0)
     """Shortest and longest wavelength of the wander (m)."""
-    half_width: float = 0.75
+    half_width: AtLeast0 = 0.75
     """Half the vehicle's width (m), which the wander keeps `margin` away from the cones."""
-    margin: float = 0.25
+    margin: AtLeast0 = 0.25
     """Distance of the vehicle's side from the cones where the track is wide enough (m)."""
     settle_distance: float = 5.0
     """Distance over which the vehicle moves from its start pose to the middle (m)."""
-    overrun: float = 10.0
+    overrun: Signed = 10.0
     """Distance driven beyond the last lap's end (m); where it is negative, the road stays open."""
-    rest: float = 0.0
+    rest: AtLeast0 = 0.0
     """Time at the start pose before the vehicle drives (s)."""
-    stand: float = field(default=0.0, repr=False)
+    stand: AtLeast0 = field(default=0.0, repr=False)
     """Time for which the vehicle stands at the end of the drive, after braking (s); it drives on if 0."""
     rate: float = 50.0
     """Rate of the odometry and of the true poses (Hz)."""
 
     def __post_init__(self) -> None:
-        positive = ("speed_max", "acceleration_lateral", "acceleration", "deceleration")
-        check_numbers(self, "vehicle", (*positive, "settle_distance", "rate"), "a positive number")
-        at_least_0 = ("speed_start", "rest", "stand", "wander", "half_width", "margin")
-        check_numbers(self, "vehicle", at_least_0, "a number of at least 0")
-        check_numbers(self, "vehicle", ("overrun",), "a number")
+        super().__post_init__()
         shortest, longest = self.wander_wavelengths
         if not 0 < shortest <= longest < np.inf:
             raise SettingsError(f"vehicle.wander_wavelengths: expected 0 < a <= b, found {shortest, longest}")

@@ -6,14 +6,15 @@ from collections.abc import Sequence
 from colorsys import rgb_to_hsv
 from dataclasses import dataclass
 from math import inf, isfinite, pi
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.errors import SettingsError, check_numbers
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import SIGMA_DETECTIONS
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
+from pathspace_graph.settings.checked import AT_LEAST_0, POSITIVE, AtLeast0, Checked, Signed, Unlimited
 
 Side = Literal["left", "right"]  # side of the x axis to which the y axis points
 # fields of a message that may hold the label of a detection, the first one that is there
@@ -56,30 +57,22 @@ class BagOptions:
 
 
 @dataclass(frozen=True)
-class NoiseSettings:
+class NoiseSettings(Checked, group=""):
     """Noise of a record that does not state it."""
 
-    sigma_odometry: tuple[float, float, float] | None = None
+    sigma_odometry: Annotated[tuple[float, float, float] | None, POSITIVE] = None
     """Each sample of [vx, vy, wz] has these standard deviations (m/s, m/s, rad/s), white from sample to
     sample. Without them they are 0.25, 0.12 and 0.035, or what a data set states of itself. The covariance in
     a message is not used, since it mostly is that of a filter's state, which is not white."""
     sigma_range: float | None = None
     """Standard deviation of the range at range 0 (m) of a detection without a covariance. Where none of these
     three is stated, they are measured, and without enough cones 0.05, 0.012 and 0.0157."""
-    sigma_range_growth: float | None = None
+    sigma_range_growth: Annotated[float | None, AT_LEAST_0] = None
     """Growth of the standard deviation of the range with the range (m/m)."""
     sigma_bearing: float | None = None
     """Standard deviation of the bearing (rad) of a detection without a covariance."""
     replace_covariances: bool = False
     """All detections have the covariance by these standard deviations, also where the record has another."""
-
-    def __post_init__(self) -> None:
-        sigmas = self.sigma_odometry
-        if sigmas is not None and (len(sigmas) != 3 or not all(0 < sigma < inf for sigma in sigmas)):
-            raise SettingsError(f"--sigma-odometry: expected three positive numbers, found {sigmas}")
-        for name in ("sigma_range", "sigma_bearing", "sigma_range_growth"):
-            expected = "a number of at least 0" if name == "sigma_range_growth" else "a positive number"
-            check_numbers(self, "convert", [name] if getattr(self, name) is not None else [], expected)
 
     @property
     def _own(self) -> tuple[float | None, ...]:
@@ -98,10 +91,10 @@ class NoiseSettings:
 
 
 @dataclass(frozen=True)
-class Frames:
+class Frames(Checked, group=""):
     """Frames in which odometry and detections were recorded."""
 
-    mounting: tuple[float, float, float] | None = None
+    mounting: Annotated[tuple[float, float, float] | None, "a number"] = None
     """Pose X Y YAW (m, m, rad) of the sensor in the vehicle frame: x forward, y left, yaw counterclockwise.
     Without it that of a bag's /tf_static is used, where there is one."""
     y: Side = "left"
@@ -111,10 +104,9 @@ class Frames:
     """Side to which the y axis of the odometry points, where it is another one than `y`."""
 
     def __post_init__(self) -> None:
-        mounting = self.mounting or (0.0, 0.0, 0.0)
-        if not all(map(isfinite, mounting)) or abs(mounting[2]) > 2.0 * pi:
-            expected = "--mounting: expected X Y YAW in m, m and rad, with a yaw of at most 2 pi"
-            raise SettingsError(f"{expected}, found {' '.join(f'{value:g}' for value in mounting)}")
+        super().__post_init__()
+        if self.mounting and abs(self.mounting[2]) > 2.0 * pi:
+            raise SettingsError(f"mounting: expected a yaw of at most 2 pi rad, found {self.mounting[2]:g}")
 
     @property
     def sides(self) -> NDArray[np.float64]:
@@ -128,16 +120,16 @@ class Frames:
 
 
 @dataclass(frozen=True)
-class Window:
+class Window(Checked, group=""):
     """Which part of a record counts, and when its detections were measured."""
 
     range_max: float | None = None
     """Largest distance from the sensor of a detection that counts (m)."""
-    time_offset: float = 0.0
+    time_offset: Signed = 0.0
     """Time (s) that is added to the stamps of the detections: negative where they are too late."""
-    start: float = 0.0
+    start: AtLeast0 = 0.0
     """Time after the first odometry at which the log begins (s)."""
-    end: float = inf
+    end: Unlimited = inf
     """Time after the first odometry at which the log ends (s)."""
     spacing: float | None = None
     """Distance of points along a line, a kerb or a wall (m), to which dense ones are thinned and polylines
@@ -145,16 +137,11 @@ class Window:
     are, at 0.15 of their median range."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.start < self.end:
-            found = f"found {self.start:g} and {self.end:g}"
-            raise SettingsError(f"--start, --end: expected times of at least 0 in this order, {found}")
-        if self.range_max is not None and not 0.0 < self.range_max < inf:
-            raise SettingsError(f"--range-max: expected a positive number, found {self.range_max:g}")
-        if self.spacing is not None and not LEAST_SPACING <= self.spacing < inf:
-            expected = f"--spacing: expected at least {LEAST_SPACING:g} m"
-            raise SettingsError(f"{expected}, found {self.spacing:g}")
-        if not isfinite(self.time_offset):
-            raise SettingsError(f"--time-offset: expected a number, found {self.time_offset:g}")
+        super().__post_init__()
+        if self.start >= self.end:
+            raise SettingsError(f"start: expected less than end, found {self.start:g} and {self.end:g}")
+        if self.spacing is not None and self.spacing < LEAST_SPACING:
+            raise SettingsError(f"spacing: expected at least {LEAST_SPACING:g} m, found {self.spacing:g}")
 
 
 class LabelRule:

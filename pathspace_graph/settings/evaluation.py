@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 from pathspace_graph.errors import SettingsError
 
-from .checked import Positive
+from .checked import Checked
 
 
 @dataclass(frozen=True)
-class GhostSettings(Positive):
+class GhostSettings(Checked):
     """Definition of a ghost."""
 
     distance: float = 2.0
@@ -17,7 +17,7 @@ class GhostSettings(Positive):
 
 
 @dataclass(frozen=True)
-class ScalingSettings(Positive):
+class ScalingSettings(Checked):
     """What is measured of how time scales."""
 
     cones_min: float = 50.0

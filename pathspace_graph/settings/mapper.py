@@ -6,7 +6,7 @@ from typing import ClassVar, Final, Literal
 from pathspace_graph.errors import SettingsError, check_type
 from pathspace_graph.labels import LEFT, RIGHT, Kind
 
-from .checked import Positive
+from .checked import Checked, Unlimited
 from .online import (
     CalibrationSettings,
     ClosingSettings,
@@ -27,7 +27,7 @@ _LINES: Final[dict[Kind | None, tuple[int, ...]]] = {  # boundaries that are lin
 
 
 @dataclass(frozen=True)
-class SplineSettings(Positive):
+class SplineSettings(Checked):
     """The two boundary curves."""
 
     degree: int = 3
@@ -75,7 +75,7 @@ class ExactSplineSettings(SplineSettings, group="spline"):
 
 
 @dataclass(frozen=True)
-class GaugeSettings(Positive):
+class GaugeSettings(Checked):
     """The weak priors on what detections leave free."""
 
     sigma_spacing: float = 0.3
@@ -87,14 +87,12 @@ class GaugeSettings(Positive):
 
 
 @dataclass(frozen=True)
-class GateSettings(Positive):
+class GateSettings(Checked):
     """Which detections are used, and how much they weigh."""
-
-    UNLIMITED = ("huber",)
 
     chi: float = 3.0
     """Gate of a detection's distance from a curve, in standard deviations of their joint uncertainty."""
-    huber: float = 1.5
+    huber: Unlimited = 1.5
     """Whitened residual beyond which the Huber loss reduces a weight; `inf` for plain least squares."""
 
     view_ahead: ClassVar[float] = 25.0  # m along a curve, of the farthest place ahead that a detection is on
@@ -112,7 +110,7 @@ class GateSettings(Positive):
 
 
 @dataclass(frozen=True)
-class FarSettings(Positive):
+class FarSettings(Checked):
     """The inactive part of the map, which is not solved for in every cycle.
 
     What is inactive keeps its linearization: a closed map differs by millimetres to centimetres, an open one
@@ -126,7 +124,7 @@ class FarSettings(Positive):
 
 
 @dataclass(frozen=True)
-class RelinearizeSettings(Positive):
+class RelinearizeSettings(Checked):
     """Which factors of the window are linearized anew in a step: those whose variables moved.
 
     This applies after the loop has closed. Until then all factors are linearized anew, since an error of
@@ -143,7 +141,7 @@ class RelinearizeSettings(Positive):
 
 
 @dataclass(frozen=True)
-class ClosureSettings(Positive, group="batch.closure"):
+class ClosureSettings(Checked, group="batch.closure"):
     """When a closed loop is believed."""
 
     used: float = 2.0 / 3.0
@@ -151,10 +149,8 @@ class ClosureSettings(Positive, group="batch.closure"):
 
 
 @dataclass(frozen=True)
-class OpenLapSettings(Positive, group="open_lap"):
+class OpenLapSettings(Checked, group="open_lap"):
     """Batch over the open lap, which closes the loop online."""
-
-    UNLIMITED = ("max_cycles", "max_cones")
 
     prior: Literal["batch", "window"] = "batch"
     """Prior after closing: a batch over the open lap, or with `window` what the window has marginalized."""
@@ -168,14 +164,14 @@ class OpenLapSettings(Positive, group="open_lap"):
     """Cycles in which the batches replace the prior in a replay: `batches.ends` of `summary.json`."""
     retry: float = 20.0
     """Least length of path from one batch of the lap to the next, where it does not agree (m)."""
-    max_cycles: float = 6000.0
+    max_cycles: Unlimited = 6000.0
     """Most cycles of an open lap that is solved as a batch; a longer one is left to the window."""
-    max_cones: float = 1500.0
+    max_cones: Unlimited = 1500.0
     """Most cones of a lap that is solved as a batch, since with more it would not be in time."""
 
 
 @dataclass(frozen=True)
-class BatchSettings(Positive):
+class BatchSettings(Checked):
     """The batch optimization over a whole log."""
 
     start: Start = "auto"
@@ -195,7 +191,7 @@ class BatchSettings(Positive):
 
 
 @dataclass(frozen=True)
-class CkfSettings(Positive):
+class CkfSettings(Checked):
     """The paper's filters."""
 
     ridge: float = 0.05
@@ -217,7 +213,7 @@ class CkfSettings(Positive):
 
 
 @dataclass(frozen=True)
-class MapperSettings(Positive):
+class MapperSettings(Checked, group=""):
     """All settings of the estimators; each takes the groups that are its own."""
 
     lag: float = 3.0

@@ -71,10 +71,10 @@ def test_a_part_of_a_drive_is_cut_out(recorded: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        (("--range-max", "0"), "--range-max: expected a positive number, found 0"),
-        (("--range-max", "inf"), "--range-max: expected a positive number, found inf"),
-        (("--start", "3", "--end", "2"), "--start, --end: expected times of at least 0 in this order"),
-        (("--time-offset", "nan"), "--time-offset: expected a number, found nan"),
+        (("--range-max", "0"), "range_max: expected a positive number, found 0"),
+        (("--range-max", "inf"), "range_max: expected a positive number, found inf"),
+        (("--start", "3", "--end", "2"), "start: expected less than end, found 3 and 2"),
+        (("--time-offset", "nan"), "time_offset: expected a number, found nan"),
     ],
 )
 def test_numbers_without_a_meaning_are_refused(

@@ -343,7 +343,7 @@ def test_a_column_numbers_the_polylines_of_a_csv_file(
     assert "80 points of lines are 1 m apart (--spacing), of 40 that were recorded" in capsys.readouterr().out
     refused = ["convert", str(tmp_path), "--from", "csv", "--out", str(tmp_path / "bad"), "--spacing", "0"]
     assert main(refused) == 2
-    assert "--spacing: expected at least 0.001 m, found 0" in capsys.readouterr().err
+    assert "spacing: expected a positive number, found 0" in capsys.readouterr().err
 
 
 def test_polylines_beside_cones_are_left_out_unless_a_spacing_is_stated(
