@@ -9,7 +9,9 @@ import numpy as np
 from numpy.random import Generator
 
 from pathspace_graph.errors import SettingsError, check_name
-from pathspace_graph.io.log import SENSOR, Detections, Log, SensorInfo, Truth, without_stated_noise
+from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.io.covariances import SIGMA_DETECTIONS, ray_covariances
+from pathspace_graph.io.log import SIGMA_ODOMETRY, Detections, Log, SensorInfo, Truth
 from pathspace_graph.labels import NAMES, UNKNOWN
 from pathspace_graph.lengths import scaled
 from pathspace_graph.settings.checked import Checked
@@ -126,11 +128,24 @@ def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
     sensor = settings.sensor
     sigmas = [sensor.range_sigma * settings.scale, sensor.range_sigma_growth, sensor.bearing_sigma]
     truth = log.truth and replace(log.truth, rays=np.array(sigmas))
-    return without_stated_noise(replace(log, truth=truth, source={**log.source, "draw": "True"}))
+    cycles = (
+        replace(cycle, covariances=ray_covariances(cycle.points_vehicle, SIGMA_DETECTIONS))
+        for cycle in log.cycles
+    )
+    return replace(
+        log,
+        cycles=tuple(cycles),
+        odometry_sigma=np.array(SIGMA_ODOMETRY),
+        sensor=SensorInfo(),
+        source={**log.source, "draw": "True"},
+        odometry_stated=False,
+        detections_stated=False,
+        truth=truth,
+    )
 
 
 def _noise(settings: SimulationSettings) -> FloatArray | None:
-    """Return the noise (6,) in the order of `io.log:NOISE`, or None where all of it is white."""
+    """Return the noise (6,) in the order of `io.header:TRUE_ERRORS`, or None where all of it is white."""
     odometry, sensor = settings.odometry, settings.sensor
     if not (any(odometry.slow) or sensor.slow_range or sensor.slow_bearing):
         return None
@@ -139,7 +154,7 @@ def _noise(settings: SimulationSettings) -> FloatArray | None:
 
 
 def _bend(sensor: SensorSettings) -> FloatArray | None:
-    """Return the bend of the ranges (2,) in the order of `io.log:BEND`, or None where they don't bend."""
+    """Bend of the ranges (2,) in the order of `io.header:TRUE_ERRORS`, None where they don't bend."""
     return np.array([sensor.range_bend, sensor.range_bend_from]) if sensor.range_bend else None
 
 

@@ -42,7 +42,7 @@ ARROWS: dict[str, set[str]] = {
     "laps": set(),
     "spline": {"factors", "settings"},
     "io": {"spline", "factors", "settings"},
-    "sim": {"io", "settings"},
+    "sim": {"factors", "io", "settings"},
     "options": {"settings", "io", "sim", "convert"},
     "convert": {"io", "factors", "settings"},
     "graph": {"factors"},

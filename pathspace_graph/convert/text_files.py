@@ -15,7 +15,7 @@ import numpy as np
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.log import covariances_of
+from pathspace_graph.io.covariances import covariances_of
 from pathspace_graph.io.parsing import (
     DELIMITERS,
     MAX_STAMP,

@@ -3,24 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
+from msgspec.structs import asdict
 from numpy.typing import ArrayLike
 
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
-from pathspace_graph.labels import KINDS, NAMES, UNKNOWN, Kind, label_from_name
+from pathspace_graph.labels import NAMES, UNKNOWN, Kind, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS
 
 from . import parsing as limits
 from .brief import Brief, pictures
+from .covariances import SIGMA_DETECTIONS, covariances_of, is_positive_definite, ray_covariances
 from .files import atomic_folder
-from .header import POSITIVE, Header, noise_sections, to_toml, toml_text
+from .header import (
+    STATED,
+    TRUE_ERRORS,
+    measured_noise,
+    noise_sections,
+    read_header,
+    to_toml,
+    toml_text,
+    true_errors,
+)
 from .parsing import Column, Table, read_table, write_table
 
 if TYPE_CHECKING:
@@ -53,27 +64,10 @@ COLUMNS: Final[dict[str, dict[str, Column]]] = {  # of each table, in the order 
 TRUTH_FILES: Final = (TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FILE)  # which are optional
 FILES: Final = (LOG_FILE, *COLUMNS)
 
-# entries of the truth in the header; the noise is there where it is not white as the log states it
-CALIBRATION: Final = ("scale", "bias")
-SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")
-NOISE: Final = ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing", "slow_time")
-BEND: Final = ("range_bend", "range_bend_from")
-RAYS: Final = ("sigma_range", "sigma_range_growth", "sigma_bearing")
-_TRUE_ERRORS: Final = {
-    "calibration": CALIBRATION,
-    "sensor": SENSOR,
-    "noise": NOISE,
-    "bend": BEND,
-    "rays": RAYS,
-}
-
 SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
-SIGMA_DETECTIONS: Final = (0.05, 0.012, np.pi / 200.0)  # (m, m/m, rad) where nothing is known
-MIN_RANGE_OF_BEARING: Final = 1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at 0
 MIN_INTERVAL: Final = 1e-3  # s between perception cycles; below, the odometry is too certain for doubles
 ROUND_OFF: Final = 1e-6  # s, of the difference of two stamps: doubles resolve those since 1970 to 2.4e-7 s
 MAX_HOLD: Final = 1.0  # s; a perception cycle later after the last twist has no odometry
-MIN_RELATIVE_DETERMINANT: Final = 1e-12  # least det over xx * yy: singular to double precision below
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -265,29 +259,20 @@ def read_log(folder: Path | str) -> Log:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
-    header = Header(folder / LOG_FILE)
+    file = folder / LOG_FILE
+    header = read_header(file)
     odometry, table = _read_odometry(_table(folder, ODOMETRY_FILE)), _table(folder, DETECTIONS_FILE)
-    truth = header.section("truth")
-    true_errors = {
-        name: np.array([header.numbers("truth", entry).item() for entry in entries])
-        for name, entries in _TRUE_ERRORS.items()
-        if truth and (entries == CALIBRATION or not truth.keys().isdisjoint(entries))
-    }
     return Log(
         odometry=odometry,
         cycles=_cycles(table, float(odometry.t[0]), float(odometry.t[-1])),
-        odometry_sigma=header.numbers("odometry", "sigma", 3, POSITIVE),
-        sensor=_read_sensor(header),
-        source={key: str(value) for key, value in header.section("source").items()},
-        **header.noise(),
-        truth=_read_truth(folder, len(table), true_errors),
+        odometry_sigma=np.array(header.odometry.sigma),
+        sensor=SensorInfo(**asdict(header.sensor)),
+        source={key: str(value) for key, value in header.source.items()},
+        odometry_stated=header.noise.odometry == STATED,
+        detections_stated=header.noise.detections == STATED,
+        measured=measured_noise(header, file),
+        truth=_read_truth(folder, len(table), true_errors(header, file)),
     )
-
-
-def _read_sensor(header: Header) -> SensorInfo:
-    numbers = [name for name in ("range_max", "fov", "rate") if name in header.section("sensor")]
-    values = {name: header.numbers("sensor", name, 1, POSITIVE).item() for name in numbers}
-    return SensorInfo(**values, kind=header.word("sensor", "kind", KINDS))
 
 
 def _table(folder: Path, name: str) -> Table:
@@ -378,45 +363,6 @@ def is_one_cycle(t: float, begin: float) -> bool:
     return abs(t - begin) <= MIN_INTERVAL + ROUND_OFF
 
 
-def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
-    return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
-
-
-def polar_covariances(bearings: Array, along: Array, across: Array) -> Array:
-    """Return `R(b) diag(along, across) R(b)^T` (m, 2, 2) of variances (m,) along rays and across them."""
-    c, s = np.cos(bearings), np.sin(bearings)
-    xx, yy = c * c * along + s * s * across, s * s * along + c * c * across
-    return covariances_of(xx, c * s * (along - across), yy)
-
-
-def ray_covariances(points: Array, sigmas: Iterable[float]) -> Array:
-    """Return covariances (m, 2, 2) by (s_range, s_growth, s_bearing) of points (m, 2) at ranges r.
-
-    `(s_range + s_growth r)^2` along the ray, `(r s_bearing)^2` across it.
-    """
-    ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
-    begin, growth, bearing = sigmas
-    across = (np.maximum(ranges, MIN_RANGE_OF_BEARING) * bearing) ** 2
-    return polar_covariances(bearings, (begin + growth * ranges) ** 2, across)
-
-
-def without_stated_noise(log: Log) -> Log:
-    """Return a log as it is made of a record that says nothing of its noise, nor of the sensor."""
-    cycles = tuple(
-        replace(cycle, covariances=ray_covariances(cycle.points_vehicle, SIGMA_DETECTIONS))
-        for cycle in log.cycles
-    )
-    log = replace(log, cycles=cycles, odometry_sigma=np.array(SIGMA_ODOMETRY), sensor=SensorInfo())
-    return replace(log, odometry_stated=False, detections_stated=False)
-
-
-def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:
-    """Return which covariances (m,) are positive definite, by their entries."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
-    return np.asarray(good)
-
-
 def labels_of(table: Table) -> IntArray:
     return table.numbers("label").astype(int)
 
@@ -443,7 +389,7 @@ def _associations(table: Table, detection_count: int, cone_count: int) -> IntArr
 
 def _sections(log: Log) -> dict[str, dict[str, Any]]:
     truth = dict[str, Any]()
-    for name, entries in _TRUE_ERRORS.items():
+    for name, entries in TRUE_ERRORS.items():
         values = getattr(log.truth, name, None)
         truth |= {} if values is None else dict(zip(entries, values.tolist(), strict=True))
     return {

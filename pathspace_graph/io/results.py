@@ -20,7 +20,7 @@ from pathspace_graph.lengths import POSE_LENGTHS, scaled
 
 from .brief import Brief, frames
 from .files import atomic_folder, write_json
-from .log import CALIBRATION
+from .header import CALIBRATION
 from .map import MAP_FILE, Map, map_to_json
 from .parsing import MAX_COORDINATE, MAX_STAMP, is_plain, read_text, shown, write_table
 
