@@ -35,6 +35,13 @@ class MessageError(PathspaceError):
     """A message is not of a kind that can be read; the text says what was expected and what was found."""
 
 
+# errors of a message or a line that cannot be read
+BROKEN: Final = (
+    *(MessageError, AttributeError, TypeError, ValueError),
+    *(IndexError, OverflowError, RecursionError),
+)
+
+
 def first_of(holder: Any, names: Iterable[str]) -> Any:
     """Return the first of these fields that a message has, or None."""
     return next((getattr(holder, name) for name in names if hasattr(holder, name)), None)
@@ -277,20 +284,32 @@ def _vertices(line: Any) -> list[tuple[float, float]] | None:
     """Return the vertices (m) of a polyline: arrays x and y, or a list of points. None of a single point."""
     if np.ndim(getattr(line, "x", 0.0)) and np.ndim(getattr(line, "y", 0.0)):
         return [(float(x), float(y)) for x, y in zip(line.x, line.y, strict=True)]
-    if any(hasattr(at, "x") and hasattr(at, "y") for at in _path(line)):
+    if any(map(_place, _path(line))):
         return None
-    lists = [getattr(line, name) for name in _names(line)]
+    lists = [getattr(line, name) for name in _names(line) if name != "covariance"]
     points = next((listed for listed in lists if _is_list(listed)), None)
     return None if points is None else [*map(_position, points)]
 
 
 def _position(cone: Any) -> tuple[float, float]:
     """Return the position of a cone (m), which may lie some fields deep, as in a pose with covariance."""
-    at = next((at for at in _path(cone) if hasattr(at, "x") and hasattr(at, "y")), None)
-    if at is None:
-        fields_of_one = ", ".join(POSITIONS)
-        raise MessageError(f"expected a cone with one of the fields {fields_of_one}, found {_names(cone)}")
-    return float(at.x), float(at.y)
+    place = next(filter(None, map(_place, _path(cone))), None)
+    if place is None:
+        expected = f"x and y, range and bearing, or one of {', '.join(POSITIONS)}"
+        raise MessageError(f"expected a cone with the fields {expected}, found {_names(cone)}")
+    return place
+
+
+def _place(at: Any) -> tuple[float, float] | None:
+    """Position (m) of a pair, or of what has x and y, or range and bearing; None of anything else."""
+    if isinstance(at, list | tuple):
+        x, y = at
+        return float(x), float(y)
+    if hasattr(at, "x") and hasattr(at, "y"):
+        return float(at.x), float(at.y)
+    if hasattr(at, "range") and hasattr(at, "bearing"):
+        return float(at.range * np.cos(at.bearing)), float(at.range * np.sin(at.bearing))
+    return None
 
 
 def _covariance(cone: Any) -> Array:

@@ -11,7 +11,7 @@ from typing import Any, Final
 import gtsam
 import numpy as np
 
-from pathspace_graph.errors import InputError, PathspaceError
+from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io import log as logs
@@ -20,7 +20,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
 from .lines import along_lines, are_lines, count, default_spacing, in_vehicle, lines_of
-from .messages import ALONE, DENSE, Points, points_of, stamp_of, twist_of
+from .messages import ALONE, BROKEN, DENSE, Points, points_of, stamp_of, twist_of
 from .settings import Frames, LabelRule, NoiseSettings, Window
 
 MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
@@ -285,8 +285,6 @@ def positive_definite(covariances: Array) -> BoolArray:
 
 
 MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle, the newest ones
-# errors of a message that cannot be read
-BROKEN: Final = (PathspaceError, AttributeError, TypeError, ValueError, IndexError, OverflowError)
 
 
 class MessageStream:

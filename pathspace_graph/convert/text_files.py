@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -27,7 +27,7 @@ from pathspace_graph.io.parsing import (
 )
 from pathspace_graph.labels import UNKNOWN
 
-from .messages import ALONE, Points, scan_points
+from .messages import ALONE, BROKEN, Points, cone_points, scan_points
 from .recording import Recording
 from .settings import LabelRule
 
@@ -52,7 +52,6 @@ MAX_BEARING: Final = 2.0 * pi  # largest bearing (rad); more are degrees
 LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are large
 _BEFORE_ZONE: Final = re.compile(r"\s+(?=(?:Z|[+-]\d\d(?::?\d\d)?)$)")  # blanks before Z or an offset
 _OTHER: Final = {"range": "bearing", "bearing": "range"}
-UNSTATED: Final = ((np.nan, np.nan), (np.nan, np.nan))  # covariance of a detection that states none
 MANY_ROWS: Final = 20  # number of rows whose nanoseconds tell that they are some
 LEAST_NANOSECONDS: Final = 1e6  # which the fractions of some seconds reach
 MIN_PERIOD: Final = 1e-5  # least mean period of samples (s); less is a wrong unit of time
@@ -248,11 +247,11 @@ def _without_place(file: _File) -> InputError:
 
 
 def read_json_lines(file: Path, rule: LabelRule) -> Recording:
-    """Return what a file of JSON lines has of a drive, in SI units; an InputError names file and line.
+    """Read the drive in a file of JSON lines, in SI units; an InputError names file and line.
 
     A line is `{"t": s, "twist": [vx, vy, wz]}` or `{"t": s, "detections": [{"x": m, "y": m, "label": "blue",
-    "covariance": [[xx, xy], [xy, yy]]}, ...]}`, with `range` and `bearing` in place of `x` and `y` where one
-    likes; label and covariance are optional. A line may have both. In place of detections it may have
+    "covariance": [[xx, xy], [xy, yy]]}, ...]}`, or both. Label and covariance are optional, and `range` and
+    `bearing` may replace `x` and `y`. Instead of detections a line may have
     `"polylines": [{"points": [[x, y], ...], "label": "left"}, ...]` or a scan as of a `LaserScan`:
     `"scan": {"angle_min": rad, "angle_increment": rad, "range_min": m, "range_max": m, "ranges": [m, ...]}`.
     """
@@ -261,59 +260,27 @@ def read_json_lines(file: Path, rule: LabelRule) -> Recording:
         if not line.strip():
             continue
         try:
-            entry = json.loads(line)
-            stamp = float(entry["t"])
-            if "twist" in entry:
+            entry = json.loads(line, object_hook=lambda entries: SimpleNamespace(**entries))
+            stamp = float(entry.t)
+            if hasattr(entry, "twist"):
                 t.append(stamp)
-                twists.append(np.array(entry["twist"], dtype=float).reshape(3))
-            points = [read(entry[key], rule) for key, read in _READERS.items() if key in entry]
-            scan_t += [stamp] * len(points)
-            scans += points
-        except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
+                twists.append(np.array(entry.twist, dtype=float).reshape(3))
+            points = [*_points_of_line(entry, rule)]
+        except BROKEN as error:
             expected = "expected a line with t, and with twist [vx, vy, wz], detections, polylines or a scan"
             found = f"found {shown(line)} ({type(error).__name__}: {error})"
             raise InputError(file, f"{expected}, {found}", row) from None
+        scan_t += [stamp] * len(points)
+        scans += points
     measured = np.array(t), np.array(twists).reshape(-1, 3)
     return Recording(*measured, np.array(scan_t), scans, {"file": file.name})
 
 
-def _points_of_objects(objects: list[dict[str, Any]], rule: LabelRule) -> Points:
-    points, covariances, labels = [], [], []
-    for one in objects:
-        is_polar = "range" in one or "bearing" in one
-        place = np.array(
-            [one[key] for key in (("range", "bearing") if is_polar else ("x", "y"))], dtype=float
-        )
-        points.append(place[0] * np.array([np.cos(place[1]), np.sin(place[1])]) if is_polar else place)
-        covariances.append(np.array(one.get("covariance", UNSTATED), dtype=float).reshape(2, 2))
-        labels.append(rule.of(one["label"]) if "label" in one else UNKNOWN)
-    return Points.of(points, labels, covariances)
-
-
-def _points_of_polylines(polylines: list[dict[str, Any]], rule: LabelRule) -> Points:
-    points, labels, lines = [], [], []
-    for number, one in enumerate(polylines):
-        vertices = np.array(one["points"], dtype=float).reshape(-1, 2)
-        points.append(vertices)
-        labels += [rule.of(one["label"]) if "label" in one else UNKNOWN] * len(vertices)
-        lines += [number] * len(vertices)
-    return Points.of(np.concatenate([np.zeros((0, 2)), *points]), labels, lines=lines)
-
-
-def _points_of_scan(scan: dict[str, Any], rule: LabelRule) -> Points:
-    ranges = [np.nan if value is None else float(value) for value in scan["ranges"]]
-    fields = {key: float(scan[key]) for key in ("angle_min", "angle_increment")}
-    fields |= {
-        "range_min": float(scan.get("range_min", 0.0)),
-        "range_max": float(scan.get("range_max", np.inf)),
-    }
-    return scan_points(SimpleNamespace(ranges=ranges, **fields))
-
-
-_READERS: Final[
-    dict[str, Callable[[Any, LabelRule], Points]]
-] = {  # of what a line may have beside its stamp and a twist
-    "detections": _points_of_objects,
-    "polylines": _points_of_polylines,
-    "scan": _points_of_scan,
-}
+def _points_of_line(entry: SimpleNamespace, rule: LabelRule) -> Iterator[Points]:
+    """Yield the points of a line's lists and of its scan, each read as a message."""
+    for name in ("detections", "polylines"):
+        if hasattr(entry, name):
+            yield cone_points(SimpleNamespace(**{name: getattr(entry, name)}), rule)
+    if hasattr(entry, "scan"):
+        scan = SimpleNamespace(**{"range_min": 0.0, "range_max": np.inf, **vars(entry.scan)})
+        yield scan_points(scan)

@@ -347,4 +347,4 @@ def test_a_line_with_a_bearing_alone_names_the_range(
     file = tmp_path / "drive.jsonl"
     file.write_text('{"t": 1, "twist": [1, 0, 0], "detections": [{"bearing": 0.1}]}\n')
     assert main(["convert", str(file), "--from", "jsonl", "--out", str(tmp_path / "log")]) == 2
-    assert "(KeyError: 'range')" in capsys.readouterr().err
+    assert "expected a cone with the fields x and y, range and bearing" in capsys.readouterr().err
