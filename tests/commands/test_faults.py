@@ -64,26 +64,6 @@ def test_runs_that_fail_are_counted(
     assert "7 of 7 cells failed, the first of ValueError: lost" in printed.err
 
 
-@pytest.mark.parametrize(
-    ("wrong", "says"),
-    [
-        (["--only", "latenc"], "the nearest is 'latency of detections'"),
-        (["--estimator", "fixed-lagg"], "the nearest is 'fixed-lag'"),
-        (["--jobs", "0"], "jobs: expected"),
-        (["--laps", "0"], "--laps: expected at least 1"),
-        (["--tracks", "none.yaml"], "none.yaml"),
-    ],
-)
-def test_bad_usage_is_one_line_and_leaves_nothing(
-    wrong: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["faults", "--out", str(tmp_path / "out"), *wrong]) == 2
-    printed = capsys.readouterr()
-    assert printed.err.count("\n") == 1
-    assert says in printed.err
-    assert not (tmp_path / "out").exists()
-
-
 def test_simulate_takes_faults(track: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["simulate", "--track", str(track), "--laps", "1", "--out", str(tmp_path / "log")]
     faults = ["--faults.sensor.latency", "0.05", "--faults.vehicle.wrong-way"]

@@ -287,11 +287,6 @@ def test_files_of_other_names_are_named(tmp_path: Path, capsys: pytest.CaptureFi
     assert len(convert(tmp_path, "--odometry", "wheels.csv", "--detections", "cones.csv").cycles) == 2
 
 
-def test_a_source_is_needed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["convert", "--from", "csv", "--out", str(tmp_path / "log")]) == 2
-    assert "convert: expected SOURCE, found none" in capsys.readouterr().err
-
-
 # --- JSON lines ------------------------------------------------------------------------------------------
 
 
