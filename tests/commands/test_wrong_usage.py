@@ -26,7 +26,7 @@ online LOG --out MAP --lag long | --lag: expected a number, found 'long' (see
 online LOG --out MAP --lag nan | lag: expected a positive number, found nan
 online LOG --out MAP --lag -1 | lag: expected a positive number, found -1
 online LOG --out MAP --lag 2 --lag 3 | --lag: expected it once, found it twice
-online LOG --out MAP --brightness 1 | expected a known option, found '--brightness' (see
+online LOG --out MAP --zzz 1 | expected a known option, found '--zzz' (see
 online LOG --out MAP --estimatr ckf | the nearest is '--estimator' (see
 online LOG --out MAP --estimator magic | ckf, fixed-lag, landmark-ckf, landmark-fixed-lag), found 'magic'
 online LOG --out MAP -o X | online: expected a known option, found '-o'
