@@ -1,6 +1,6 @@
 """The faults of a real car that white noise does not have, off by default, and what they do to a drive."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -8,11 +8,12 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.settings.checked import AtLeast0, Checked, Share, Signed
 
-from .curves import FloatArray, IntArray, arc_lengths
+from .curves import arc_lengths
 from .sensor import OdometryNoise, measure_twists
 from .track import Track
 from .vehicle import Drive
@@ -57,7 +58,7 @@ class OdometryFaults(Checked, group="faults.odometry"):
 
     yaw_rate_bias: Signed = 0.0
     """Bias of the yaw rate beside the drawn one (rad/s)."""
-    speed_scale: Signed = field(default=0.0, repr=False)
+    speed_scale: Signed = 0.0
     """Share by which the speeds are too large, beside the drawn scale (-)."""
     slip: Signed = 0.0
     """Share by which the speeds are too large while the wheels slip (-)."""
@@ -73,9 +74,9 @@ class OdometryFaults(Checked, group="faults.odometry"):
     """Time without a measured twist, so that the last one before is held (s)."""
     gap_at: AtLeast0 = 0.5
     """Laps after which the gap begins."""
-    false_travel: AtLeast0 = field(default=0.0, repr=False)
+    false_travel: AtLeast0 = 0.0
     """Speed (m/s) below which the odometry doesn't fall while the vehicle brakes to its last stand."""
-    false_travel_time: AtLeast0 = field(default=3.0, repr=False)
+    false_travel_time: AtLeast0 = 3.0
     """Time for which it goes on so while the vehicle stands (s)."""
 
 
@@ -132,7 +133,7 @@ def put_down(driven: Drive, lap: float, faults: VehicleFaults) -> Drive:
 
 def measure_odometry(
     driven: Drive, lap: float, noise: OdometryNoise, faults: OdometryFaults, rng: Generator
-) -> tuple[Odometry, FloatArray]:
+) -> tuple[Odometry, Array]:
     """Return the measured twists, and the scale error (-) and the bias (rad/s) that they have (2,)."""
     dt = float(driven.t[:2][-1])
     wheels = _wheel_twists(driven, faults)
@@ -146,7 +147,7 @@ def measure_odometry(
     return Odometry(driven.t[kept], measured[kept]), calibration + constant
 
 
-def _wheel_twists(driven: Drive, faults: OdometryFaults) -> FloatArray:
+def _wheel_twists(driven: Drive, faults: OdometryFaults) -> Array:
     """Return the twists (N, 3) of the body, except where the wheels slip or report false travel."""
     twists = driven.twists.copy()
     if faults.slip:

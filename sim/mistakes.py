@@ -11,10 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT
 
-from .curves import FloatArray
 from .vehicle import integrate
 
 Mistake = Callable[[Log], Log]
@@ -26,19 +26,19 @@ def with_cycles(log: Log, change: Callable[[Detections], dict[str, Any]]) -> Log
     return replace(log, cycles=tuple(replace(cycle, **change(cycle)) for cycle in log.cycles))
 
 
-def with_points(log: Log, change: Callable[[FloatArray], FloatArray]) -> Log:
+def with_points(log: Log, change: Callable[[Array], Array]) -> Log:
     return with_cycles(log, lambda cycle: {"points_vehicle": change(cycle.points_vehicle)})
 
 
-def with_covariances(log: Log, change: Callable[[FloatArray], FloatArray]) -> Log:
+def with_covariances(log: Log, change: Callable[[Array], Array]) -> Log:
     return with_cycles(log, lambda cycle: {"covariances": change(cycle.covariances)})
 
 
-def with_twists(log: Log, factors: FloatArray | tuple[float, float, float]) -> Log:
+def with_twists(log: Log, factors: Array | tuple[float, float, float]) -> Log:
     return with_twists_of(log, log.odometry.twist * factors)
 
 
-def with_twists_of(log: Log, twist: FloatArray) -> Log:
+def with_twists_of(log: Log, twist: Array) -> Log:
     return replace(log, odometry=replace(log.odometry, twist=twist))
 
 
@@ -47,7 +47,7 @@ def with_stamps(log: Log, odometry: float = 1.0, detections: float = 1.0) -> Log
     return replace(log, odometry=replace(log.odometry, t=log.odometry.t * odometry))
 
 
-def turned(log: Log, to_vehicle: FloatArray) -> Log:
+def turned(log: Log, to_vehicle: Array) -> Log:
     """Return the log with detections in a frame that a matrix (2, 2) takes to the vehicle's."""
     log = with_covariances(log, lambda covariances: to_vehicle.T @ covariances @ to_vehicle)
     return with_points(log, lambda points: points @ to_vehicle)
@@ -70,14 +70,14 @@ def camera(log: Log, height: float = 0.6, sigma: float = 0.02) -> Log:
 def bearings_as_degrees(log: Log) -> Log:
     """Return the log with detections made of bearings in degrees that were taken for radians."""
 
-    def wrong(points: FloatArray) -> FloatArray:
+    def wrong(points: Array) -> Array:
         ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0]) / DEGREE
         return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
 
     return with_points(log, wrong)
 
 
-def dead_reckoned(log: Log) -> FloatArray:
+def dead_reckoned(log: Log) -> Array:
     """Return poses (N, 3) at the odometry's stamps, by the odometry alone."""
     return integrate(log.odometry.twist[:-1], np.diff(log.odometry.t))
 

@@ -1,6 +1,6 @@
 """The vehicle's sensors: noisy odometry, and a detector of cones."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Final
 
 import numpy as np
@@ -8,12 +8,11 @@ import scipy  # which imports its modules when they are used
 from numpy.random import Generator
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.covariances import polar_covariances
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.settings.checked import AT_LEAST_0, POSITIVE, AtLeast0, Checked, Share, Signed
-
-from .curves import BoolArray, FloatArray, IntArray
 
 FALSE_POSITIVE: Final = -1  # association of a detection that is of no cone
 CAMERAS: Final = 2  # cameras that may see a cone at once
@@ -29,12 +28,12 @@ class OdometryNoise(Checked, group="odometry"):
     """Standard deviation of the scale error of vx and vy, drawn once for a log (-)."""
     gyro_bias: AtLeast0 = 0.0015
     """Standard deviation of the bias of wz, drawn once for a log (rad/s)."""
-    slow: Annotated[tuple[float, float, float], AT_LEAST_0] = field(default=(0.0, 0.0, 0.0), repr=False)
+    slow: Annotated[tuple[float, float, float], AT_LEAST_0] = (0.0, 0.0, 0.0)
     """Standard deviations of the slow errors of [vx, vy, wz] beside the white noise (m/s, m/s, rad/s)."""
-    slow_time: float = field(default=5.0, repr=False)
+    slow_time: float = 5.0
     """Correlation time of the slow errors (s)."""
 
-    def drift_sigmas(self, dt: float) -> FloatArray:
+    def drift_sigmas(self, dt: float) -> Array:
         """Return the standard deviations (3,) of white noise that drifts as much, `dt` s apart.
 
         The spectrum at frequency 0: `white^2 + slow^2 (1 + rho) / (1 - rho)`, `rho = exp(-dt / slow_time)`.
@@ -77,21 +76,21 @@ class SensorSettings(Checked):
     """Increasing ranges of the given systematic errors (m), which are linear between them."""
     range_bias_values: tuple[float, ...] = (0.02, 0.34)
     """Systematic errors at those ranges (m), typical of cameras."""
-    range_bend: Signed = field(default=0.0, repr=False)
+    range_bend: Signed = 0.0
     """Bend k of the ranges (1/m): a range r reads `k (r - range_bend_from)^2` longer beyond that range."""
-    range_bend_from: AtLeast0 = field(default=9.0, repr=False)
+    range_bend_from: AtLeast0 = 9.0
     """Range from which on ranges bend (m)."""
-    slow_range: Share = field(default=0.0, repr=False)
+    slow_range: Share = 0.0
     """Share of a range's variance in the slow error of its cone (-)."""
-    slow_bearing: Share = field(default=0.0, repr=False)
+    slow_bearing: Share = 0.0
     """Share of a bearing's variance in the slow error of its cone (-)."""
-    slow_time: float = field(default=5.0, repr=False)
+    slow_time: float = 5.0
     """Correlation time of the slow errors of a cone (s)."""
-    duplicates: Share = field(default=0.0, repr=False)
+    duplicates: Share = 0.0
     """Probability that a second camera detects a detected cone of the overlap too, with its own errors."""
-    overlap: tuple[float, float] = field(default=(0.0, float(np.pi)), repr=False)
+    overlap: tuple[float, float] = (0.0, float(np.pi))
     """Least and greatest bearing of the overlap, on both sides (rad)."""
-    dropped_cycles: Share = field(default=0.0, repr=False)
+    dropped_cycles: Share = 0.0
     """Share of the cycles in which nothing is detected."""
 
     def __post_init__(self) -> None:
@@ -110,18 +109,18 @@ class SensorSettings(Checked):
             expected = "expected increasing ranges, one for each of range_bias_values"
             raise SettingsError(f"sensor.range_bias_at: {expected}")
 
-    def range_sigmas(self, ranges: FloatArray) -> FloatArray:
+    def range_sigmas(self, ranges: Array) -> Array:
         return self.range_sigma + self.range_sigma_growth * ranges
 
-    def is_inside(self, ranges: FloatArray, bearings: FloatArray) -> BoolArray:
+    def is_inside(self, ranges: Array, bearings: Array) -> BoolArray:
         near = (ranges >= self.range_min) & (ranges <= self.range_max)
         return near & (np.abs(bearings) <= self.fov / 2)
 
-    def probabilities(self, ranges: FloatArray) -> FloatArray:
+    def probabilities(self, ranges: Array) -> Array:
         """Return the probabilities of detection at true ranges (m,)."""
         return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
 
-    def systematic_errors(self, ranges: FloatArray) -> FloatArray:
+    def systematic_errors(self, ranges: Array) -> Array:
         """Return how much longer (m) true ranges (m,) read than they are."""
         biased = self.range_bias and len(self.range_bias_at) > 0
         errors = np.interp(ranges, self.range_bias_at, self.range_bias_values) if biased else 0.0
@@ -129,9 +128,7 @@ class SensorSettings(Checked):
         return np.asarray(errors + self.range_bend * beyond**2)
 
 
-def measure_twists(
-    twists: FloatArray, dt: float, noise: OdometryNoise, rng: Generator
-) -> tuple[FloatArray, FloatArray]:
+def measure_twists(twists: Array, dt: float, noise: OdometryNoise, rng: Generator) -> tuple[Array, Array]:
     """Return `(1 + scale) [vx, vy]`, `wz + bias` (N, 3), `dt` s apart, with noise, and [scale, bias]."""
     scale = noise.scale * rng.standard_normal()
     bias = noise.gyro_bias * rng.standard_normal()
@@ -143,7 +140,7 @@ def measure_twists(
     return measured, np.array([scale, bias])
 
 
-def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatArray:
+def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> Array:
     """Return Gauss-Markov processes of unit variance along axis 0; neighbours correlate by `exp(-step)`."""
     rho = np.exp(-step)
     drawn = rng.standard_normal(shape)
@@ -151,7 +148,7 @@ def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatAr
     return np.asarray(scipy.signal.lfilter([1.0], [1.0, -rho], drawn, axis=0))
 
 
-def seen_from(pose: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+def seen_from(pose: Array, points: Array) -> tuple[Array, Array]:
     """Return ranges (m,) and bearings (m,) in [-pi, pi) of points (m, 2) from a pose [x, y, theta]."""
     step = points - pose[:2]
     bearings = np.arctan2(step[:, 1], step[:, 0]) - pose[2]
@@ -159,7 +156,7 @@ def seen_from(pose: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def polar_detections(
-    t: float, ranges: FloatArray, bearings: FloatArray, labels: IntArray, settings: SensorSettings
+    t: float, ranges: Array, bearings: Array, labels: IntArray, settings: SensorSettings
 ) -> Detections:
     """Return measured ranges and bearings (m,) as a cycle, with the covariances of the sensor's noise."""
     points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
@@ -167,9 +164,7 @@ def polar_detections(
     return Detections(t, points, polar_covariances(bearings, along, across), labels)
 
 
-def false_positives(
-    settings: SensorSettings, rng: Generator
-) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+def false_positives(settings: SensorSettings, rng: Generator) -> tuple[Array, Array, IntArray, IntArray]:
     """Draw detections of nothing, uniform over the area of the field, with either boundary's label."""
     count = int(rng.poisson(settings.false_positives))
     ranges = np.sqrt(rng.uniform(settings.range_min**2, settings.range_max**2, count))
@@ -179,7 +174,7 @@ def false_positives(
 
 
 class ConeSensor:
-    def __init__(self, cones: FloatArray, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
+    def __init__(self, cones: Array, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
         blind_rng, self._cone_rng, self._false_rng, self._slow_rng, self._second_rng, self._drop_rng = (
             rng.spawn(6)
         )
@@ -190,7 +185,7 @@ class ConeSensor:
         self._slow = self._slow_rng.standard_normal((CAMERAS, 2, len(cones)))
 
     def detect(
-        self, t: float, pose: FloatArray, scale: float = 0.0, bias: float = 0.0
+        self, t: float, pose: Array, scale: float = 0.0, bias: float = 0.0
     ) -> tuple[Detections, IntArray]:
         """Return a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
 
@@ -207,8 +202,8 @@ class ConeSensor:
         return detections.where(kept), cones[kept]
 
     def _detect_cones(
-        self, pose: FloatArray, scale: float, bias: float
-    ) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+        self, pose: Array, scale: float, bias: float
+    ) -> tuple[Array, Array, IntArray, IntArray]:
         settings, rng = self._settings, self._cone_rng
         ranges, bearings = seen_from(pose, self._cones[self._seen])
         inside = settings.is_inside(ranges, bearings)
@@ -230,7 +225,7 @@ class ConeSensor:
         index = np.nonzero(rows)[1]
         return ranges[rows], bearings[rows], labels[index], cones[index]
 
-    def _errors(self, white: FloatArray, cones: IntArray) -> FloatArray:
+    def _errors(self, white: Array, cones: IntArray) -> Array:
         """Return errors (2, 2, m) of unit variance by camera, range or bearing, and cone.
 
         Each cone's slow errors are Gauss-Markov processes that go on while it is not seen.

@@ -1,7 +1,7 @@
 """A drive on a track: track, vehicle and sensors give a log with truth; and sensors of a real car by name."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any, Final, Self
 
@@ -9,15 +9,16 @@ import numpy as np
 from numpy.random import Generator
 
 from pathspace_graph.errors import SettingsError, check_name
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.covariances import SIGMA_DETECTIONS, ray_covariances
 from pathspace_graph.io.log import SIGMA_ODOMETRY, Detections, Log, SensorInfo, Truth
+from pathspace_graph.io.overrides import leaves
 from pathspace_graph.labels import NAMES, UNKNOWN
 from pathspace_graph.lengths import scaled
 from pathspace_graph.settings.checked import Checked
 
 from .cameras import CAMERA, CAMERA_FAULTS, INS, INS_RATE, DrawnCar, draw_car
-from .curves import FloatArray, IntArray
 from .faults import (
     Faults,
     OdometryFaults,
@@ -43,12 +44,12 @@ class SimulationSettings(Checked, group=""):
     vehicle: VehicleSettings = field(default_factory=VehicleSettings)
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
     sensor: SensorSettings = field(default_factory=SensorSettings)
-    line: LineSettings = field(default_factory=LineSettings, repr=False)
-    faults: Faults = field(default_factory=Faults, repr=False)
-    scale: float = field(default=1.0, repr=False)
+    line: LineSettings = field(default_factory=LineSettings)
+    faults: Faults = field(default_factory=Faults)
+    scale: float = 1.0
     """Factor of all lengths and speeds: 0.1 for a model car of 1:10, 3 for a road."""
 
-    draw: bool = field(default=False, repr=False)
+    draw: bool = False
     """Whether sensor, odometry, their faults and the vehicle are drawn by the seed (`sim.cameras:draw_car`).
     The log states nothing of their noise. Of those only the vehicle's overrun can be set beside it."""
 
@@ -144,7 +145,7 @@ def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
     )
 
 
-def _noise(settings: SimulationSettings) -> FloatArray | None:
+def _noise(settings: SimulationSettings) -> Array | None:
     """Return the noise (6,) in the order of `io.header:TRUE_ERRORS`, or None where all of it is white."""
     odometry, sensor = settings.odometry, settings.sensor
     if not (any(odometry.slow) or sensor.slow_range or sensor.slow_bearing):
@@ -153,7 +154,7 @@ def _noise(settings: SimulationSettings) -> FloatArray | None:
     return np.array([*drift, sensor.slow_range, sensor.slow_bearing, sensor.slow_time])
 
 
-def _bend(sensor: SensorSettings) -> FloatArray | None:
+def _bend(sensor: SensorSettings) -> Array | None:
     """Bend of the ranges (2,) in the order of `io.header:TRUE_ERRORS`, None where they don't bend."""
     return np.array([sensor.range_bend, sensor.range_bend_from]) if sensor.range_bend else None
 
@@ -166,14 +167,10 @@ def _sensor_info(settings: SimulationSettings) -> SensorInfo:
 
 
 def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
-    source = {"track": track.name, "seed": str(seed), "settings": repr(settings)}
-    source |= {"scale": str(settings.scale)} if settings.scale != 1.0 else {}
-    for group in ("odometry", "sensor", "line", "vehicle", "faults.sensor", "faults.odometry"):
-        part = attrgetter(group)(settings)
-        changed = [entry.name for entry in fields(part) if not entry.repr]
-        changed = [name for name in changed if getattr(part, name) != getattr(type(part)(), name)]
-        source |= {f"{group}.{name}": str(getattr(part, name)) for name in changed}
-    return source if settings.faults == Faults() else source | {"faults": repr(settings.faults)}
+    """Track, seed, and each setting that isn't the default."""
+    defaults = leaves(SimulationSettings())
+    changed = {name: str(value) for name, value in leaves(settings).items() if value != defaults[name]}
+    return {"track": track.name, "seed": str(seed), **changed}
 
 
 def _sensor(track: Track, settings: SimulationSettings, rng: Generator) -> ConeSensor | LineSensor:
@@ -221,7 +218,7 @@ def _perceive(
     return cycles, np.concatenate(associations)
 
 
-def _poses_at(driven: Drive, stamps: FloatArray) -> FloatArray:
+def _poses_at(driven: Drive, stamps: Array) -> Array:
     """Return true poses (n, 3) at any stamps within the drive; the twist before each is held until then."""
     index = np.searchsorted(driven.t, stamps, side="right") - 1
     poses = driven.poses[index]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -10,9 +10,10 @@ import scipy  # which imports its modules when they are used
 from numpy.random import Generator
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.settings.checked import AtLeast0, Checked, Signed
 
-from .curves import CentreLine, FloatArray, arc_lengths, curvature, direction, left_normals
+from .curves import CentreLine, arc_lengths, curvature, direction, left_normals
 from .track import Track
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ class VehicleSettings(Checked):
     """Distance driven beyond the last lap's end (m); where it is negative, the road stays open."""
     rest: AtLeast0 = 0.0
     """Time at the start pose before the vehicle drives (s)."""
-    stand: AtLeast0 = field(default=0.0, repr=False)
+    stand: AtLeast0 = 0.0
     """Time for which the vehicle stands at the end of the drive, after braking (s); it drives on if 0."""
     rate: float = 50.0
     """Rate of the odometry and of the true poses (Hz)."""
@@ -65,9 +66,9 @@ class VehicleSettings(Checked):
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    t: FloatArray  # stamps (N,) in s, from 0
-    poses: FloatArray  # true poses [x, y, theta] (N, 3), map frame, from (0, 0, 0); theta is not wrapped
-    twists: FloatArray  # true body twists [vx, vy, wz] (N, 3), each held until the next stamp
+    t: Array  # stamps (N,) in s, from 0
+    poses: Array  # true poses [x, y, theta] (N, 3), map frame, from (0, 0, 0); theta is not wrapped
+    twists: Array  # true body twists [vx, vy, wz] (N, 3), each held until the next stamp
 
 
 def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> Drive:
@@ -83,14 +84,14 @@ def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) ->
     return Drive(t, integrate(twists[:-1], 1.0 / settings.rate), twists)
 
 
-def integrate(twists: FloatArray, dt: float | FloatArray) -> FloatArray:
+def integrate(twists: Array, dt: float | Array) -> Array:
     """Integrate body twists (N, 3), each constant for `dt`, to poses (N + 1, 3) from 0 by SE(2)'s exp."""
     theta = np.concatenate([[0.0], np.cumsum(twists[:, 2] * dt)])
     steps = displacements(theta[:-1], twists, dt)[:, :2]
     return np.column_stack([np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]), theta])
 
 
-def displacements(theta: FloatArray, twists: FloatArray, dt: float | FloatArray) -> FloatArray:
+def displacements(theta: Array, twists: Array, dt: float | Array) -> Array:
     """Return what body twists (N, 3), each constant for `dt`, add to poses with headings theta (N,)."""
     a, b = _exponential(twists[:, 2] * dt)
     dx = (a * twists[:, 0] - b * twists[:, 1]) * dt
@@ -99,7 +100,7 @@ def displacements(theta: FloatArray, twists: FloatArray, dt: float | FloatArray)
     return np.column_stack([cos * dx - sin * dy, sin * dx + cos * dy, twists[:, 2] * dt])
 
 
-def _twists(poses: FloatArray, dt: float) -> FloatArray:
+def _twists(poses: Array, dt: float) -> Array:
     """Return body twists (N, 3), each of which leads to the next pose in `dt` (SE(2) logarithm)."""
     step = np.diff(poses, axis=0)
     cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
@@ -110,7 +111,7 @@ def _twists(poses: FloatArray, dt: float) -> FloatArray:
     return np.vstack([twists, twists[-1:]])
 
 
-def _exponential(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _exponential(angle: Array) -> tuple[Array, Array]:
     """Return `sin(angle) / angle` and `(1 - cos(angle)) / angle`, also at 0."""
     half = np.sinc(angle / (2 * np.pi))
     return np.sinc(angle / np.pi), np.sin(angle / 2) * half
@@ -134,9 +135,7 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
     )
 
 
-def _settling(
-    line: CentreLine, start: float, pose: FloatArray, s: FloatArray, settings: VehicleSettings
-) -> FloatArray:
+def _settling(line: CentreLine, start: float, pose: Array, s: Array, settings: VehicleSettings) -> Array:
     """Return a lateral offset (n,) that begins with the start pose's offset and slope and dies away."""
     point, tangent = line.points(np.array([start]))[0], line.tangents(np.array([start]))[0]
     normal = left_normals(tangent)
@@ -148,7 +147,7 @@ def _settling(
     return np.asarray((offset + (slope + offset / settings.settle_distance) * s) * decay)
 
 
-def _wander(s: FloatArray, clearance: FloatArray, settings: VehicleSettings, rng: Generator) -> FloatArray:
+def _wander(s: Array, clearance: Array, settings: VehicleSettings, rng: Generator) -> Array:
     shortest, longest = settings.wander_wavelengths
     wavenumbers = 2 * np.pi * rng.uniform(1 / longest, 1 / shortest, WAVES)
     phases = rng.uniform(0.0, 2 * np.pi, WAVES)
@@ -158,7 +157,7 @@ def _wander(s: FloatArray, clearance: FloatArray, settings: VehicleSettings, rng
     return np.asarray(np.tanh(wave) * room * begin)
 
 
-def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> FloatArray:
+def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> Array:
     """Return speeds (n,) at the path's knots that keep the acceleration limits, by two passes."""
     s = path.x
     bend = np.abs(curvature(np.asarray(path(s, 1)), np.asarray(path(s, 2))))
@@ -174,7 +173,7 @@ def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> FloatArray:
     return np.sqrt(speed2)
 
 
-def _stations(path: CubicSpline, speeds: FloatArray, rate: float) -> FloatArray:
+def _stations(path: CubicSpline, speeds: Array, rate: float) -> Array:
     s = path.x
     durations = 2 * np.diff(s) / (speeds[1:] + speeds[:-1])
     knots_t = np.concatenate([[0.0], np.cumsum(durations)])

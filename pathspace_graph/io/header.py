@@ -147,7 +147,7 @@ def noise_sections(odometry: bool, detections: bool, measured: MeasuredNoise | N
         values[name] = [*values[name].sigma, values[name].share, values[name].time]
     entries = (_MeasuredRays if has_rays else _Measured).__struct_fields__
     names = [name for name in entries if name != "range_bend" or measured.range_bend]
-    return {"noise": section, "noise.measured": {name: np.asarray(values[name]).tolist() for name in names}}
+    return {"noise": section, "noise.measured": {name: values[name] for name in names}}
 
 
 def to_toml(sections: Mapping[str, Mapping[str, Any]]) -> str:
@@ -159,8 +159,8 @@ def to_toml(sections: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def toml_text(value: Any) -> str:
-    """A text, a number or a list of numbers as TOML."""
+    """A text, a number or an array of numbers as TOML."""
     if not isinstance(value, str):
-        return repr(value)
+        return repr(np.asarray(value).tolist())
     # a JSON string is a TOML string, but for the delete character
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -391,14 +391,10 @@ def _sections(log: Log) -> dict[str, dict[str, Any]]:
     truth = dict[str, Any]()
     for name, entries in TRUE_ERRORS.items():
         values = getattr(log.truth, name, None)
-        truth |= {} if values is None else dict(zip(entries, values.tolist(), strict=True))
+        truth |= {} if values is None else dict(zip(entries, values, strict=True))
     return {
-        "odometry": {"sigma": [float(value) for value in log.odometry_sigma]},
-        "sensor": {
-            name: value if isinstance(value, str) else float(value)
-            for name, value in vars(log.sensor).items()
-            if value is not None
-        },
+        "odometry": {"sigma": log.odometry_sigma},
+        "sensor": vars(log.sensor),
         **noise_sections(log.odometry_stated, log.detections_stated, log.measured),
         "source": {toml_text(key): value for key, value in log.source.items()},
         **({"truth": truth} if truth else {}),
