@@ -18,20 +18,11 @@ from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, UNKNOWN, Kind, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS
 
+from . import header as headers
 from . import parsing as limits
 from .brief import Brief, pictures
 from .covariances import SIGMA_DETECTIONS, covariances_of, is_positive_definite, ray_covariances
 from .files import atomic_folder
-from .header import (
-    STATED,
-    TRUE_ERRORS,
-    measured_noise,
-    noise_sections,
-    read_header,
-    to_toml,
-    toml_text,
-    true_errors,
-)
 from .parsing import Column, Table, read_table, write_table
 
 if TYPE_CHECKING:
@@ -116,8 +107,6 @@ class Detections(Brief):
 
     def with_others(self, other: Detections) -> Detections:
         """Return these detections followed by other ones of the same cycle."""
-        if len(other.labels) == 0:
-            return self
         names = ("points_vehicle", "covariances", "labels")
         return Detections(
             self.t, *(np.concatenate([getattr(of, name) for of in (self, other)]) for name in names)
@@ -238,8 +227,8 @@ class Log:
         K = np.asarray(ray_covariances(points, SIGMA_DETECTIONS) if m is None else m, float).reshape(-1, 4)
         words = [label_from_name(one) if isinstance(one, str) else one for one in labels or ()]
         labelled = words if labels is not None else np.full(len(points), UNKNOWN)
-        odometry = _read_odometry(_as_table(ODOMETRY_FILE, t, twist))
-        found = _as_table(DETECTIONS_FILE, detection_t, points, labelled, K[:, [0, 1, 3]])
+        odometry = _read_odometry(_of_arrays(ODOMETRY_FILE, t, twist))
+        found = _of_arrays(DETECTIONS_FILE, detection_t, points, labelled, K[:, [0, 1, 3]])
         return cls(
             odometry,
             _cycles(found, float(odometry.t[0]), float(odometry.t[-1])),
@@ -260,7 +249,7 @@ def read_log(folder: Path | str) -> Log:
     if not folder.is_dir():
         raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
     file = folder / LOG_FILE
-    header = read_header(file)
+    header = headers.read_header(file)
     odometry, table = _read_odometry(_table(folder, ODOMETRY_FILE)), _table(folder, DETECTIONS_FILE)
     return Log(
         odometry=odometry,
@@ -268,32 +257,22 @@ def read_log(folder: Path | str) -> Log:
         odometry_sigma=np.array(header.odometry.sigma),
         sensor=SensorInfo(**asdict(header.sensor)),
         source={key: str(value) for key, value in header.source.items()},
-        odometry_stated=header.noise.odometry == STATED,
-        detections_stated=header.noise.detections == STATED,
-        measured=measured_noise(header, file),
-        truth=_read_truth(folder, len(table), true_errors(header, file)),
+        odometry_stated=header.noise.odometry == headers.STATED,
+        detections_stated=header.noise.detections == headers.STATED,
+        measured=headers.measured_noise(header, file),
+        truth=_read_truth(folder, len(table), headers.true_errors(header, file)),
     )
 
 
 def _table(folder: Path, name: str) -> Table:
     """Return a table of a log; one of the truth that is not known has no rows."""
     if name in TRUTH_FILES and not (folder / name).exists():
-        return Table(
-            folder / name, dict.fromkeys(COLUMNS[name], np.zeros(0)), np.zeros(0, int), COLUMNS[name]
-        )
+        return Table.of_arrays(folder / name, COLUMNS[name], np.zeros((0, len(COLUMNS[name]))))
     return read_table(folder / name, COLUMNS[name])
 
 
-def _as_table(name: str, *values: ArrayLike) -> Table:
-    """Return arrays (rows,) and (rows, k) as the table that is read from a file with their columns."""
-    file, columns = Path(name).with_suffix(""), COLUMNS[name]
-    try:
-        rows = np.column_stack([np.asarray(value, float) for value in values])
-    except ValueError as error:
-        raise InputError(file, f"expected arrays of numbers with a row each: {error}") from None
-    if rows.shape[1] != len(columns):
-        raise InputError(file, f"expected the columns {', '.join(columns)}, found {rows.shape[1]}")
-    return Table(file, dict(zip(columns, rows.T, strict=True)), np.arange(len(rows)) + 1, columns)
+def _of_arrays(name: str, *values: ArrayLike) -> Table:
+    return Table.of_arrays(Path(name).with_suffix(""), COLUMNS[name], *values)
 
 
 def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
@@ -303,7 +282,7 @@ def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
     """
     check_type("log", log, Log)
     with atomic_folder(folder, LOG_FILE) as target:
-        (target / LOG_FILE).write_text(to_toml(_sections(log)), encoding="utf-8", newline="\n")
+        (target / LOG_FILE).write_text(headers.to_toml(_sections(log)), encoding="utf-8", newline="\n")
         for name, values in _columns(log).items():
             write_table(target / name, COLUMNS[name], *values)
         if check:
@@ -379,8 +358,8 @@ def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) ->
 
 def _associations(table: Table, detection_count: int, cone_count: int) -> IntArray:
     if len(table) != detection_count:
-        expected = f"expected a row for each of {detection_count} detections"
-        raise InputError(table.file, f"{expected}, found {len(table)}")
+        expected = f"a row for each of {detection_count} detections"
+        raise InputError(table.file, f"expected {expected}, found {len(table)}")
     cones = table.numbers("cone")
     good = (cones == np.floor(cones)) & (cones >= -1) & (cones < cone_count)
     table.require(good, f"expected -1 or the index of one of {cone_count} true cones")
@@ -389,14 +368,14 @@ def _associations(table: Table, detection_count: int, cone_count: int) -> IntArr
 
 def _sections(log: Log) -> dict[str, dict[str, Any]]:
     truth = dict[str, Any]()
-    for name, entries in TRUE_ERRORS.items():
+    for name, entries in headers.TRUE_ERRORS.items():
         values = getattr(log.truth, name, None)
         truth |= {} if values is None else dict(zip(entries, values, strict=True))
     return {
         "odometry": {"sigma": log.odometry_sigma},
         "sensor": vars(log.sensor),
-        **noise_sections(log.odometry_stated, log.detections_stated, log.measured),
-        "source": {toml_text(key): value for key, value in log.source.items()},
+        **headers.noise_sections(log.odometry_stated, log.detections_stated, log.measured),
+        "source": {headers.toml_text(key): value for key, value in log.source.items()},
         **({"truth": truth} if truth else {}),
     }
 

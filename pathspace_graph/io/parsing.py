@@ -15,7 +15,7 @@ from io import BytesIO, TextIOWrapper
 from itertools import chain, islice
 from pathlib import Path
 from reprlib import Repr
-from typing import Any, Final, NamedTuple, NoReturn, TypeVar
+from typing import Any, Final, NamedTuple, NoReturn, Self, TypeVar
 
 import msgspec
 import numpy as np
@@ -230,6 +230,17 @@ class Table:
     columns: dict[str, Any]  # numbers (rows,) of declared columns, which may not be finite; texts of others
     lines: IntArray  # line of each row in the file; the header is line 1
     declared: Mapping[str, Column] = field(default_factory=dict)
+
+    @classmethod
+    def of_arrays(cls, file: Path, declared: Mapping[str, Column], *values: ArrayLike) -> Self:
+        """Make the table of arrays (rows,) and (rows, k) that a file with their columns would give."""
+        try:
+            rows = np.column_stack([np.asarray(value, float) for value in values])
+        except ValueError as error:
+            raise InputError(file, f"expected arrays of numbers with a row each: {error}") from None
+        if rows.shape[1] != len(declared):
+            raise InputError(file, f"expected the columns {', '.join(declared)}, found {rows.shape[1]}")
+        return cls(file, dict(zip(declared, rows.T, strict=True)), np.arange(len(rows)) + 1, declared)
 
     def __len__(self) -> int:
         return len(self.lines)
