@@ -36,7 +36,7 @@ class ReadingError(PathspaceError):
         super().__init__(f"{when}{where}: expected {expected}, found {value}")
 
     def at(self, t: float) -> Self:
-        """Return the error with the stamp t (s) of its cycle."""
+        """Add the stamp t (s) of the cycle."""
         return type(self)(self.field, self.expected, self.found, self.row, t)
 
     def __reduce__(self) -> tuple[type[Self], tuple[object, ...]]:

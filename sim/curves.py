@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 
 def ring(points: Array) -> Array:
-    """Return the points (n, 2) of a closed curve with the first one repeated at the end (n + 1, 2)."""
+    """Points (n, 2) of a closed curve with the first one repeated at the end (n + 1, 2)."""
     return np.vstack([points, points[:1]])
 
 
 def arc_lengths(points: Array) -> Array:
-    """Return the path length (n,) in m along a polyline (n, 2) from its first point to each."""
+    """Path length (n,) in m along a polyline (n, 2) from its first point to each."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
@@ -34,17 +34,17 @@ def unit(vectors: Array) -> Array:
 
 
 def left_normals(tangents: Array) -> Array:
-    """Return the vectors (n, 2) turned a quarter to the left."""
+    """Turn vectors (n, 2) by a quarter to the left."""
     return np.stack([-tangents[..., 1], tangents[..., 0]], axis=-1)
 
 
 def direction(theta: float) -> Array:
-    """Return the unit vector (2,) of a heading in rad."""
+    """Unit vector (2,) of a heading in rad."""
     return np.array([np.cos(theta), np.sin(theta)])
 
 
 def curvature(first: Array, second: Array) -> Array:
-    """Return the signed curvature (n,) in 1/m, positive to the left, from both derivatives (n, 2)."""
+    """Signed curvature (n,) in 1/m, positive to the left, from both derivatives (n, 2)."""
     cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     return np.asarray(cross / np.linalg.norm(first, axis=1) ** 3)
 
@@ -80,7 +80,7 @@ class CentreLine:
         return np.interp(s, self.spline.x, self.clearance, period=period)
 
     def nearest(self, pose: Array) -> float:
-        """Return the arc length of the point nearest to a pose (3,) whose tangent leads forward."""
+        """Arc length of the point nearest to a pose (3,) whose tangent leads forward."""
         s = np.arange(0.0, self.length, STEP)
         distances = np.linalg.norm(self.points(s) - pose[:2], axis=1)
         ahead = self.tangents(s) @ direction(pose[2])
@@ -88,7 +88,7 @@ class CentreLine:
 
 
 def fit_centre_line(left: Array, right: Array, closed: bool, near: Array) -> CentreLine:
-    """Return the curve halfway between two rows of cones (n, 2) and (m, 2) in driving order.
+    """Fit the curve halfway between two rows of cones (n, 2) and (m, 2) in driving order.
 
     The rows are matched from `near` on by the triangulation of least total squared width along both.
     """
@@ -108,13 +108,13 @@ def fit_centre_line(left: Array, right: Array, closed: bool, near: Array) -> Cen
 
 
 def along_path(points: Array, cones: Array, closed: bool) -> CentreLine:
-    """Return the smooth curve along points (k, 2), whose clearance is the distance to the nearest cone."""
+    """Fit a smooth curve along points (k, 2), whose clearance is the distance to the nearest cone."""
     curve = _smooth(resample(points, STEP, closed)[0], closed)
     return _as_spline(curve, np.asarray(scipy.spatial.KDTree(cones).query(curve)[0]), closed)
 
 
 def match_rows(left: Array, right: Array, closed: bool, near: Array) -> IntArray:
-    """Return index pairs (k, 2) into both rows, each step advancing one, of least total squared distance."""
+    """Match rows by index pairs (k, 2), each step advancing one, of least total squared distance."""
     if not closed:
         return _match(left, right)[1]
     best_cost, best = np.inf, np.zeros((0, 2), dtype=int)
@@ -147,7 +147,7 @@ def _match(left: Array, right: Array) -> tuple[float, IntArray]:
 
 
 def resample(points: Array, step: float, closed: bool) -> tuple[Array, Array]:
-    """Return points (n, 2) about `step` apart along a polyline, and their fractional indices in it (n,)."""
+    """Points (n, 2) about `step` apart along a polyline, and their fractional indices in it (n,)."""
     polyline = ring(points) if closed else points
     s = arc_lengths(polyline)
     count = max(int(np.ceil(s[-1] / step)), 2)
@@ -170,7 +170,7 @@ def _normals(curve: Array, closed: bool) -> Array:
 
 
 def _row_distances(curve: Array, row: Array, index: IntArray, closed: bool) -> Array:
-    """Return the distance of each sample to the row's segments near its matched cone `index` (n,)."""
+    """Distance of each sample to the row's segments near its matched cone `index` (n,)."""
     segments = index[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS)
     mode: Literal["wrap", "clip"] = "wrap" if closed else "clip"
     a, b = (row.take(ends, axis=0, mode=mode) for ends in (segments, segments + 1))

@@ -74,7 +74,7 @@ def _apexes(points: Array) -> Apexes:
 
 
 def _first_rung(points: Array, split: int, apexes: Apexes, start: Array) -> Rung | None:
-    """Return the nearest rung across the start's heading, its left cone on the left."""
+    """Nearest rung across the start's heading, its left cone on the left."""
     rungs = np.array([edge for edge in apexes if edge[0] < split <= edge[1]], dtype=int).reshape(-1, 2)
     step, heading = points[rungs] - start[:2], direction(start[2])
     along, across = step @ heading, step @ left_normals(heading)
@@ -110,7 +110,7 @@ def _next_apex(points: Array, apexes: Sequence[int], rung: Rung, forward: bool) 
 
 
 def _row(cones: Array, walked: list[int], closed: bool) -> IntArray:
-    """Return the cones walked, in order and once each, with missed ones inserted where they fit."""
+    """Order the walked cones, each once, and insert missed ones where they fit."""
     row = list(dict.fromkeys(walked))
     for missed in sorted(set(range(len(cones))) - set(row)):
         if len(row) < 2:

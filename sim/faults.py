@@ -113,7 +113,7 @@ def _is_during(driven: Drive, distance: float, time: float) -> NDArray[np.bool_]
 
 
 def turned_round(track: Track) -> Track:
-    """Return a closed track as it is when it is driven the other way round: what was left is right."""
+    """Reverse the direction of a closed track, whose left cones are right ones then."""
     if not track.closed:
         raise SettingsError("faults.vehicle.wrong_way: expected a closed track, found an open one")
     start = track.start + np.array([0.0, 0.0, np.pi])
@@ -121,7 +121,7 @@ def turned_round(track: Track) -> Track:
 
 
 def put_down(driven: Drive, lap: float, faults: VehicleFaults) -> Drive:
-    """Return the drive without the stretch that the vehicle is carried over; a lap is `lap` m long."""
+    """Remove the stretch over which the vehicle is carried; a lap is `lap` m long."""
     if not faults.put_down:
         return driven
     s = arc_lengths(driven.poses[:, :2])
@@ -134,7 +134,7 @@ def put_down(driven: Drive, lap: float, faults: VehicleFaults) -> Drive:
 def measure_odometry(
     driven: Drive, lap: float, noise: OdometryNoise, faults: OdometryFaults, rng: Generator
 ) -> tuple[Odometry, Array]:
-    """Return the measured twists, and the scale error (-) and the bias (rad/s) that they have (2,)."""
+    """Measure the twists; also return their scale error (-) and bias (rad/s) (2,)."""
     dt = float(driven.t[:2][-1])
     wheels = _wheel_twists(driven, faults)
     measured, calibration = measure_twists(wheels, dt, noise, rng)
@@ -148,7 +148,7 @@ def measure_odometry(
 
 
 def _wheel_twists(driven: Drive, faults: OdometryFaults) -> Array:
-    """Return the twists (N, 3) of the body, except where the wheels slip or report false travel."""
+    """Twists (N, 3) of the body, except where the wheels slip or report false travel."""
     twists = driven.twists.copy()
     if faults.slip:
         since = driven.t % faults.slip_every
@@ -164,7 +164,7 @@ def _wheel_twists(driven: Drive, faults: OdometryFaults) -> Array:
 
 
 def colours(track: Track, wrong_way: bool) -> IntArray:
-    """Return the label that the colour of each cone stands for (M,), the other side's if driven backwards."""
+    """Labels (M,) that the cones' colours stand for; the other side's if driven the wrong way."""
     labels = track.cone_labels
     changed = wrong_way & np.isin(labels, BOUNDARIES)
     return np.where(changed, LEFT + RIGHT - labels, labels)

@@ -66,7 +66,7 @@ class BoundaryCurve:
         return left_normals(unit(np.asarray(self._spline(s, 1))))
 
     def beyond(self, s: Array, begin: float) -> Array:
-        """Return how far (m,) places `s` lie beyond `begin`, round a closed curve; negative before it."""
+        """Distances (m,) of places `s` beyond `begin`, round a closed curve; negative before it."""
         return (s - begin) % self.length if self._closed else s - begin
 
 
@@ -79,7 +79,7 @@ def _through(points: Array, closed: bool) -> CubicSpline:
 
 
 def as_lines(track: Track) -> Track:
-    """Return a track whose cones are points of its boundaries, each the smooth curve through the cones."""
+    """Replace the cones of a track by points of smooth curves through them."""
     if track.path is not None:
         raise SettingsError(f"line.spacing: expected a track between two boundaries, found the {track.name}")
     left, right = (_true_points(row, track.closed) for row in (track.left, track.right))
@@ -115,7 +115,7 @@ class LineSensor:
     def detect(
         self, t: float, pose: Array, scale: float = 0.0, bias: float = 0.0
     ) -> tuple[Detections, IntArray]:
-        """Return a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
+        """Detect a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
 
         The second result is the point of the true boundary nearest to each detection (m,).
         """
@@ -133,7 +133,7 @@ class LineSensor:
     def _detect_lines(
         self, pose: Array, scale: float, bias: float
     ) -> tuple[Array, Array, IntArray, IntArray, Array]:
-        """Return measured ranges and bearings, labels, nearest true points and normals (m, 2)."""
+        """Measured ranges and bearings, labels, nearest true points and normals (m, 2)."""
         settings, rng = self._settings, self._noise_rng
         points, normals, nearest = self._draw()
         chance, colour = rng.random((2, len(points)))
@@ -165,6 +165,6 @@ class LineSensor:
 
 
 def _to_vehicle(theta: float) -> Array:
-    """Return the matrix (2, 2) by which rows of vectors in the map frame turn into the vehicle's."""
+    """Matrix (2, 2) by which rows of vectors in the map frame turn into the vehicle's."""
     ahead = direction(theta)
     return np.column_stack([ahead, left_normals(ahead)])

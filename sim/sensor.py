@@ -34,7 +34,7 @@ class OdometryNoise(Checked, group="odometry"):
     """Correlation time of the slow errors (s)."""
 
     def drift_sigmas(self, dt: float) -> Array:
-        """Return the standard deviations (3,) of white noise that drifts as much, `dt` s apart.
+        """Standard deviations (3,) of white noise that drifts as much, `dt` s apart.
 
         The spectrum at frequency 0: `white^2 + slow^2 (1 + rho) / (1 - rho)`, `rho = exp(-dt / slow_time)`.
         """
@@ -117,11 +117,11 @@ class SensorSettings(Checked):
         return near & (np.abs(bearings) <= self.fov / 2)
 
     def probabilities(self, ranges: Array) -> Array:
-        """Return the probabilities of detection at true ranges (m,)."""
+        """Probabilities of detection at true ranges (m,)."""
         return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
 
     def systematic_errors(self, ranges: Array) -> Array:
-        """Return how much longer (m) true ranges (m,) read than they are."""
+        """Systematic errors (m,) of true ranges (m,), in m."""
         biased = self.range_bias and len(self.range_bias_at) > 0
         errors = np.interp(ranges, self.range_bias_at, self.range_bias_values) if biased else 0.0
         beyond = np.maximum(ranges - self.range_bend_from, 0.0)
@@ -129,7 +129,7 @@ class SensorSettings(Checked):
 
 
 def measure_twists(twists: Array, dt: float, noise: OdometryNoise, rng: Generator) -> tuple[Array, Array]:
-    """Return `(1 + scale) [vx, vy]`, `wz + bias` (N, 3), `dt` s apart, with noise, and [scale, bias]."""
+    """`(1 + scale) [vx, vy]`, `wz + bias` (N, 3), `dt` s apart, with noise, and [scale, bias]."""
     scale = noise.scale * rng.standard_normal()
     bias = noise.gyro_bias * rng.standard_normal()
     white = rng.standard_normal(twists.shape) * np.array(noise.white)
@@ -141,7 +141,7 @@ def measure_twists(twists: Array, dt: float, noise: OdometryNoise, rng: Generato
 
 
 def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> Array:
-    """Return Gauss-Markov processes of unit variance along axis 0; neighbours correlate by `exp(-step)`."""
+    """Draw Gauss-Markov processes of unit variance along axis 0; neighbours correlate by `exp(-step)`."""
     rho = np.exp(-step)
     drawn = rng.standard_normal(shape)
     drawn[1:] *= np.sqrt(1.0 - rho**2)
@@ -149,7 +149,7 @@ def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> Array:
 
 
 def seen_from(pose: Array, points: Array) -> tuple[Array, Array]:
-    """Return ranges (m,) and bearings (m,) in [-pi, pi) of points (m, 2) from a pose [x, y, theta]."""
+    """Ranges (m,) and bearings (m,) in [-pi, pi) of points (m, 2) from a pose [x, y, theta]."""
     step = points - pose[:2]
     bearings = np.arctan2(step[:, 1], step[:, 0]) - pose[2]
     return np.hypot(step[:, 0], step[:, 1]), (bearings + np.pi) % (2 * np.pi) - np.pi
@@ -158,7 +158,7 @@ def seen_from(pose: Array, points: Array) -> tuple[Array, Array]:
 def polar_detections(
     t: float, ranges: Array, bearings: Array, labels: IntArray, settings: SensorSettings
 ) -> Detections:
-    """Return measured ranges and bearings (m,) as a cycle, with the covariances of the sensor's noise."""
+    """Make a cycle of measured ranges and bearings (m,), with the covariances of the sensor's noise."""
     points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
     along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
     return Detections(t, points, polar_covariances(bearings, along, across), labels)
@@ -187,7 +187,7 @@ class ConeSensor:
     def detect(
         self, t: float, pose: Array, scale: float = 0.0, bias: float = 0.0
     ) -> tuple[Detections, IntArray]:
-        """Return a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
+        """Detect a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
 
         The second result is the true cone of each detection (m,).
         """
@@ -226,7 +226,7 @@ class ConeSensor:
         return ranges[rows], bearings[rows], labels[index], cones[index]
 
     def _errors(self, white: Array, cones: IntArray) -> Array:
-        """Return errors (2, 2, m) of unit variance by camera, range or bearing, and cone.
+        """Errors (2, 2, m) of unit variance by camera, range or bearing, and cone.
 
         Each cone's slow errors are Gauss-Markov processes that go on while it is not seen.
         """

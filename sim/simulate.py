@@ -75,7 +75,7 @@ class SimulationSettings(Checked, group=""):
                 raise SettingsError(f"draw: expected no setting of {group} beside it, as it is drawn")
 
     def with_car(self, car: DrawnCar) -> Self:
-        """Return the settings of the same drive with a drawn car."""
+        """Replace the car by a drawn one."""
         faults = replace(self.faults, sensor=car.sensor_faults, odometry=car.odometry_faults)
         vehicle = replace(car.vehicle, overrun=self.vehicle.overrun)
         changed = replace(self, draw=False, vehicle=vehicle, faults=faults)
@@ -83,7 +83,7 @@ class SimulationSettings(Checked, group=""):
 
 
 def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
-    """Return the log of a drive; a seed gives the same log to the byte.
+    """Simulate a drive; a seed gives the same log to the byte.
 
     Wander, odometry, sensor, lost colours and a drawn car have random streams of their own, so that a setting
     of one does not shift the others. A cycle in which nothing is detected is not in the log.
@@ -125,7 +125,7 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
 
 
 def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
-    """Return a log of these settings that states nothing of its noise, which its truth has instead."""
+    """Remove the stated noise from a log of these settings; its truth has it instead."""
     sensor = settings.sensor
     sigmas = [sensor.range_sigma * settings.scale, sensor.range_sigma_growth, sensor.bearing_sigma]
     truth = log.truth and replace(log.truth, rays=np.array(sigmas))
@@ -146,7 +146,7 @@ def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
 
 
 def _noise(settings: SimulationSettings) -> Array | None:
-    """Return the noise (6,) in the order of `io.header:TRUE_ERRORS`, or None where all of it is white."""
+    """Noise (6,) in the order of `io.header:TRUE_ERRORS`, or None where all of it is white."""
     odometry, sensor = settings.odometry, settings.sensor
     if not (any(odometry.slow) or sensor.slow_range or sensor.slow_bearing):
         return None
@@ -188,7 +188,7 @@ def _perceive(
     sensor_rng: Generator,
     colour_rng: Generator,
 ) -> tuple[list[Detections], IntArray]:
-    """Return the cycles of a sensor that is mounted badly and fails at times, and their associations.
+    """Detect the cycles of a faulty sensor, and their associations.
 
     A lap is `lap` m long.
     """
@@ -219,7 +219,7 @@ def _perceive(
 
 
 def _poses_at(driven: Drive, stamps: Array) -> Array:
-    """Return true poses (n, 3) at any stamps within the drive; the twist before each is held until then."""
+    """True poses (n, 3) at any stamps within the drive; the twist before each is held until then."""
     index = np.searchsorted(driven.t, stamps, side="right") - 1
     poses = driven.poses[index]
     return poses + displacements(poses[:, 2], driven.twists[index], stamps - driven.t[index])
@@ -238,7 +238,7 @@ PRESETS: Final[dict[str, dict[str, dict[str, Any]]]] = {
 
 
 def preset(names: Mapping[str, str]) -> SimulationSettings:
-    """Return the defaults of a simulation with named presets for some groups."""
+    """Defaults of a simulation with named presets for some groups."""
     settings = SimulationSettings()
     for group, name in names.items():
         check_name(name, PRESETS[group], f"{group}: expected a known preset")

@@ -52,7 +52,7 @@ class Track:
 
 
 def _passed(cones: Array, path: Array) -> Array:
-    """Return the cones (n, 2) beside a path (k, 2), in the order in which it passes them, some repeatedly."""
+    """Order cones (n, 2) as a path (k, 2) passes them, some repeatedly."""
     apart = np.linalg.norm(cones[:, None] - path, axis=2)
     beside = apart < BESIDE * np.median(apart.min(axis=1))
     passes = list[tuple[int, int]]()
@@ -92,7 +92,7 @@ SPACING: Final = 5.0  # distance of the cones along it (m)
 
 
 def skidpad() -> Track:
-    """Return the two circles, entered and left along x between them: two rounds right, two rounds left.
+    """Skidpad: two circles, entered and left along x between them: two rounds right, two rounds left.
 
     Cones have the colour of their side as each circle is driven; those of the lanes are orange.
     """
@@ -133,7 +133,7 @@ def _line(begin: float, end: float) -> Array:
 
 
 def acceleration() -> Track:
-    """Return the straight along x with its gates, and the road on which vehicles brake."""
+    """Acceleration: a straight along x with its gates, and the road on which vehicles brake."""
     x = np.arange(0.0, STRETCH + BRAKING + SPACING / 2, SPACING)
     left = np.column_stack([x, np.full(len(x), LANE / 2)])
     gates = [(at, y) for at in (0.3, STRETCH + 0.3) for y in (-LANE / 2 - 0.3, LANE / 2 + 0.3)]

@@ -49,7 +49,7 @@ class TrackFormat:
 
 
 def read_track(path: Path | str) -> Track:
-    """Return the track in a file, with its cones in driving order; an InputError names the row or the key."""
+    """Read the track in a file, its cones in driving order; an InputError names the row or key."""
     path = Path(path)
     if not path.is_file():
         raise InputError(path, f"expected a track file, found {'a folder' if path.is_dir() else 'none'}")
@@ -167,7 +167,7 @@ def _with_hidden(track: Track, hidden: Array) -> Track:
 
 
 def _pacsim_cones(cones: Cones) -> tuple[Array, NDArray[np.str_]]:
-    """Return the points (n, 2) and the classes (n,) of a list of cones."""
+    """Points (n, 2) and the classes (n,) of a list of cones."""
     points = _points([cone.position for cone in cones or ()])
     return points, np.array([str(cone.kind) for cone in cones or ()], str)
 
@@ -235,7 +235,7 @@ def _eufs(path: Path, _: Table) -> Track:
 
 
 def _eufs_start(table: Table, tags: NDArray[np.str_], points: Array, left: Array, right: Array) -> Array:
-    """Return the pose of the first `car_start`, or one between the first blue cone and its opposite."""
+    """Pose of the first `car_start`, or one between the first blue cone and its opposite."""
     rows = np.flatnonzero(tags == "car_start")
     if len(rows):
         text = table.columns.get("direction", [""] * len(table))[rows[0]].strip()
@@ -253,7 +253,7 @@ def _eufs_start(table: Table, tags: NDArray[np.str_], points: Array, left: Array
 
 
 def _without_duplicates(cones: Array) -> Array:
-    """Return the cones (n, 2) that are not within the duplicate distance of one kept before."""
+    """Drop cones (n, 2) within the duplicate distance of one kept before."""
     kept, count = np.empty_like(cones), 0
     for cone in cones:
         if (np.linalg.norm(kept[:count] - cone, axis=1) >= DUPLICATE_DISTANCE).all():
@@ -278,7 +278,7 @@ def _tum(path: Path, _: Table) -> Track:
 
 
 def _tum_circuit(path: Path) -> Array:
-    """Return checked rows [x, y, right width, left width], with the first repeated at the end (n + 1, 4)."""
+    """Checked rows [x, y, right width, left width], with the first repeated at the end (n + 1, 4)."""
     table = read_table(path, TUM_COLUMNS, comment="#")
     circuit = table.stack(TUM_COLUMNS)
     widths = circuit[:, 2:]

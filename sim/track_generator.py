@@ -63,7 +63,7 @@ class TrackGeneratorSettings(Checked, group="generator"):
 
 
 def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = None) -> Track:
-    """Return a random closed track that keeps the rules and starts on its longest straight."""
+    """Generate a random closed track that keeps the rules and starts on its longest straight."""
     settings = settings or TrackGeneratorSettings()
     for _ in range(MAX_ATTEMPTS):
         width = rng.uniform(*settings.width)
@@ -86,7 +86,7 @@ def _least_radius(width: float) -> float:
 
 
 def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _Layout | None:
-    """Return a star-shaped polygon with hairpins on some sides, or None where a corner cannot be rounded."""
+    """Draw a star-shaped polygon with hairpins on some sides, or None where a corner cannot be rounded."""
     count = int(rng.integers(*settings.corners, endpoint=True))
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
     distances = rng.uniform(0.35, 1.0, count)
@@ -148,7 +148,7 @@ def _turns(corners: Array) -> Array:
 
 
 def _curve(layout: _Layout, rng: Generator) -> Array:
-    """Return samples (n, 2) of the centre line: straights and their elements, joined by eased arcs."""
+    """Samples (n, 2) of the centre line: straights and their elements, joined by eased arcs."""
     (corners, radii), turns = layout, _turns(layout.corners)
     tangent = radii * np.tan(np.abs(turns) / 2)
     pieces: list[Array] = []
@@ -169,7 +169,7 @@ def _curve(layout: _Layout, rng: Generator) -> Array:
 
 
 def _arc(begin: Array, direction: Array, radius: float, turn: float) -> Array:
-    """Return samples of an arc from `begin` on, first along `direction`."""
+    """Samples of an arc from `begin` on, first along `direction`."""
     angles = turn * np.linspace(0.0, 1.0, max(int(radius * abs(turn) / curves.STEP), 1), endpoint=False)
     normal = left_normals(direction) * np.sign(turn)
     forward, sideways = np.sin(np.abs(angles))[:, None], 1 - np.cos(angles)[:, None]
@@ -177,7 +177,7 @@ def _arc(begin: Array, direction: Array, radius: float, turn: float) -> Array:
 
 
 def _straight(begin: Array, end: Array, rng: Generator) -> Array:
-    """Return samples from `begin` to `end`, by chance with a slalom or a chicane where there is room."""
+    """Samples from `begin` to `end`, by chance with a slalom or a chicane where there is room."""
     length = float(np.linalg.norm(end - begin))
     if length < curves.STEP:
         return begin[None]
@@ -192,7 +192,7 @@ def _straight(begin: Array, end: Array, rng: Generator) -> Array:
 
 
 def _slalom(along: Array, length: float, rng: Generator) -> Array:
-    """Return two or three eased waves `A sin(2 pi s / wavelength)`, or zeros where there is no room."""
+    """Draw two or three eased waves `A sin(2 pi s / wavelength)`, or zeros where there is no room."""
     wavelength = rng.uniform(14.0, 22.0)
     waves = min(int(length / wavelength), 3)
     if waves < 2:
@@ -207,7 +207,7 @@ def _slalom(along: Array, length: float, rng: Generator) -> Array:
 
 
 def _chicane(along: Array, length: float, rng: Generator) -> Array:
-    """Return a shift to one side and back by half cosine waves, or zeros where there is no room."""
+    """Draw a shift to one side and back by half cosine waves, or zeros where there is no room."""
     shift, hold = rng.uniform(8.0, 13.0), rng.uniform(0.0, 5.0)
     total = 2 * shift + hold
     if length < total:
@@ -244,7 +244,7 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def _is_separate(curve: Array, distance: float) -> bool:
-    """Return whether samples nearer than `distance` are of one stretch, apart by less than half a circle."""
+    """Whether samples nearer than `distance` are of one stretch, apart by less than half a circle."""
     pairs = scipy.spatial.KDTree(curve).query_pairs(distance, output_type="ndarray")
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
     apart = np.minimum(apart, len(curve) - apart) * curves.STEP
@@ -252,7 +252,7 @@ def _is_separate(curve: Array, distance: float) -> bool:
 
 
 def _with_cones(curve: Array, width: float, settings: TrackGeneratorSettings, rng: Generator) -> Track:
-    """Return the track that starts early on the longest straight, with cones along both boundaries."""
+    """Start early on the longest straight, and place cones along both boundaries."""
     first, run = _longest_run(np.abs(_curvature(curve)) < 1 / STRAIGHT_RADIUS)
     curve = np.roll(curve, -(first + run // 3), axis=0)
     along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
@@ -280,7 +280,7 @@ def _straight_gap(rows: list[Array], crowding: Array, settings: TrackGeneratorSe
 
 
 def _cumulative(row: Array, gap: float, crowding: Array) -> Array:
-    """Return the number of cones from the first sample to each, and round to the first again (n + 1,).
+    """Number of cones from the first sample to each, and round to the first again (n + 1,).
 
     They are `gap` (m) apart where nothing crowds them.
     """

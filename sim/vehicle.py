@@ -92,7 +92,7 @@ def integrate(twists: Array, dt: float | Array) -> Array:
 
 
 def displacements(theta: Array, twists: Array, dt: float | Array) -> Array:
-    """Return what body twists (N, 3), each constant for `dt`, add to poses with headings theta (N,)."""
+    """Displacements (N, 3) by body twists (N, 3), each constant for `dt`, from headings theta (N,)."""
     a, b = _exponential(twists[:, 2] * dt)
     dx = (a * twists[:, 0] - b * twists[:, 1]) * dt
     dy = (b * twists[:, 0] + a * twists[:, 1]) * dt
@@ -101,7 +101,7 @@ def displacements(theta: Array, twists: Array, dt: float | Array) -> Array:
 
 
 def _twists(poses: Array, dt: float) -> Array:
-    """Return body twists (N, 3), each of which leads to the next pose in `dt` (SE(2) logarithm)."""
+    """Body twists (N, 3), each of which leads to the next pose in `dt` (SE(2) logarithm)."""
     step = np.diff(poses, axis=0)
     cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     dx, dy = cos * step[:, 0] + sin * step[:, 1], -sin * step[:, 0] + cos * step[:, 1]
@@ -112,13 +112,13 @@ def _twists(poses: Array, dt: float) -> Array:
 
 
 def _exponential(angle: Array) -> tuple[Array, Array]:
-    """Return `sin(angle) / angle` and `(1 - cos(angle)) / angle`, also at 0."""
+    """`sin(angle) / angle` and `(1 - cos(angle)) / angle`, also at 0."""
     half = np.sinc(angle / (2 * np.pi))
     return np.sinc(angle / np.pi), np.sin(angle / 2) * half
 
 
 def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> CubicSpline:
-    """Return the path from the start pose on, nearly by arc length: the centre line with an offset."""
+    """Path from the start pose on, nearly by arc length: the centre line with an offset."""
     line = track.centre_line
     start = line.nearest(track.start)
     total = laps * line.length + settings.overrun if line.closed else line.length - start
@@ -136,7 +136,7 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
 
 
 def _settling(line: CentreLine, start: float, pose: Array, s: Array, settings: VehicleSettings) -> Array:
-    """Return a lateral offset (n,) that begins with the start pose's offset and slope and dies away."""
+    """Lateral offset (n,) that begins with the start pose's offset and slope and dies away."""
     point, tangent = line.points(np.array([start]))[0], line.tangents(np.array([start]))[0]
     normal = left_normals(tangent)
     offset = float(normal @ (pose[:2] - point))
@@ -158,7 +158,7 @@ def _wander(s: Array, clearance: Array, settings: VehicleSettings, rng: Generato
 
 
 def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> Array:
-    """Return speeds (n,) at the path's knots that keep the acceleration limits, by two passes."""
+    """Speeds (n,) at the path's knots that keep the acceleration limits, by two passes."""
     s = path.x
     bend = np.abs(curvature(np.asarray(path(s, 1)), np.asarray(path(s, 2))))
     cornering2 = settings.acceleration_lateral / np.maximum(bend, np.finfo(float).tiny)

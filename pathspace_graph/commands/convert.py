@@ -52,7 +52,7 @@ def convert_command(options: Convert) -> Outcome:
 
 
 def _records(options: Convert) -> list[Path]:
-    """Return the records in the source where it is a folder of several, none where it is one itself."""
+    """Records in a folder of several; none where the source is a record itself."""
     folder = options.source
     if not folder.is_dir() or (folder / "metadata.yaml").exists():
         return []
@@ -86,7 +86,7 @@ def _read(options: Convert, source: Path, rule: LabelRule) -> Recording:
 
 
 def with_measured_noise(log: Log) -> Log:
-    """Return a log whose noise is measured where nobody has stated it."""
+    """Measure the noise of a log where it is not stated."""
     if log.odometry_stated and log.detections_stated:
         return log
     scale, settings = scale_of(log), MapperSettings(kind=log.sensor.kind)
@@ -126,7 +126,7 @@ def report(notes: Counter[str], rule: LabelRule, log: Log) -> None:
 
 
 def outline(log: Log) -> str:
-    """Return in a line what a look at the log should show first: rates, speeds, ranges and labels."""
+    """One line about the log: rates, speeds, ranges and labels."""
     twists, seconds = log.odometry.twist, float(np.ptp(log.odometry.t))
     ranges = np.concatenate([np.hypot(*cycle.points_vehicle.T) for cycle in log.cycles])
     labels = np.bincount(np.concatenate([cycle.labels for cycle in log.cycles]), minlength=len(NAMES))

@@ -38,7 +38,7 @@ def compare_maps(first: Path, second: Path, out: Path) -> Outcome:
 
 
 def apart_table(apart: MapsApart) -> Table:
-    """Return the distances of both boundaries together, and of each."""
+    """Distances of both boundaries together, and of each."""
     table = Table()
     table.add_column("boundary")
     for name in STATISTICS:

@@ -47,7 +47,7 @@ def check_picture(file: Path) -> None:
 
 
 def _differences(file: Path) -> list[tuple[float, float]]:
-    """Return the places (m) at which a map differs from the one that was known, by its summary."""
+    """Places (m) at which a map differs from the one that was known, by its summary."""
     summary = read_json(file, "a summary") if file.exists() else {}
     return [(one["x"], one["y"]) for one in summary.get("differences", [])]
 

@@ -1,4 +1,4 @@
-"""Points of lines, kerbs or walls: at a spacing along their row, and of the side of the way driven."""
+"""Points of lines, kerbs or walls: evenly spaced, and labelled by their side of the driven path."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -24,13 +24,13 @@ NEXT_LINE: Final = 1.5  # distance of a polyline from the way by that of the nea
 
 
 def are_lines(scans: list[Points], spacing: float | None) -> bool:
-    """Return whether a record has points of lines: it has a stated spacing, or no point that stands alone."""
+    """Whether a record has points of lines: it has a stated spacing, or no point that stands alone."""
     lines = np.concatenate([np.zeros(0, int), *(scan.lines for scan in scans)])
     return spacing is not None or bool(len(lines) and (lines != ALONE).all())
 
 
 def default_spacing(scans: list[Points]) -> float:
-    """Return the spacing (m) of a record that states none."""
+    """Spacing (m) of a record that states none."""
     points = np.concatenate([np.zeros((0, 2)), *(scan.points for scan in scans)])
     return max(SPACING_SHARE * float(np.median(np.hypot(*points.T))), LEAST_SPACING)
 
@@ -43,9 +43,9 @@ def lines_of(
     spacing: float | None,
     notes: Counter[str],
 ) -> list[Points]:
-    """Return scans at the stamps t (n,) in s with points at a spacing (m), each of a side of the way driven.
+    """Space the points of scans at the stamps t (n,) in s evenly (m), and label them by the driven path.
 
-    A point keeps the label that it has. What is farther from the way than a boundary is left out.
+    A label that a point has stays. Points farther from the path than a boundary are dropped.
     """
     spacing = spacing or default_spacing(scans)
     found = [along_lines(scan, spacing) for scan in scans]
@@ -73,19 +73,19 @@ def count(scans: Iterable[Points]) -> int:
 
 
 def in_vehicle(points: Array, frames: Frames) -> Array:
-    """Return points (m, 2) of the sensor in the vehicle frame."""
+    """Transform points (m, 2) of the sensor to the vehicle frame."""
     x, y, yaw = frames.mounting or (0.0, 0.0, 0.0)
     return np.asarray((points * frames.sides) @ rotation(yaw).T + np.array([x, y]))
 
 
 def farthest(lateral: Array) -> float:
-    """Return the largest distance (m) of a boundary from the way, by all lateral distances (m,)."""
+    """Largest distance (m) of a boundary from the way, by all lateral distances (m,)."""
     known = np.abs(lateral[np.isfinite(lateral)])
     return WALL_FARTHEST * float(np.median(known)) if len(known) else np.inf
 
 
 def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
-    """Return which points (m,) are of the polylines nearest to the way on their side, or of none."""
+    """Which points (m,) are of the polylines nearest to the way on their side, or of none."""
     kept = np.ones(len(lines), bool)
     numbers = np.unique(lines[lines >= 0])
     middles = np.array([np.nanmedian(lateral[lines == line]) for line in numbers])
@@ -97,7 +97,7 @@ def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
 
 
 def along_lines(points: Points, spacing: float) -> Points:
-    """Return points at a spacing (m): polylines are interpolated, what is dense is thinned."""
+    """Interpolate polylines and thin dense points to a spacing (m)."""
     parts = [points.where(thinned(points.points, spacing, points.lines < 0))]
     for line in np.unique(points.lines[points.lines >= 0]):
         own = points.where(points.lines == line)
@@ -108,14 +108,14 @@ def along_lines(points: Points, spacing: float) -> Points:
 
 
 def resampled(vertices: Array, spacing: float) -> Array:
-    """Return the points (m, 2) of a polyline (n, 2) at each multiple of the spacing (m) along it."""
+    """Points (m, 2) of a polyline (n, 2) at each multiple of the spacing (m)."""
     s = np.append(0.0, np.cumsum(np.hypot(*np.diff(vertices, axis=0).T)))
     at = np.arange(0.0, s[-1] + 1e-9 * spacing, spacing)
     return np.column_stack([np.interp(at, s, vertices[:, 0]), np.interp(at, s, vertices[:, 1])])
 
 
 def thinned(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
-    """Return the indices of chosen points (m, 2) no two of which are nearer than the spacing (m).
+    """Indices of chosen points (m, 2) no two of which are nearer than the spacing (m).
 
     They are taken by bearing: by range, the noise of the ranges would decide which of some points is kept.
     """
@@ -149,7 +149,7 @@ class DrivenWay:
         return cls(odometry.t, poses, s, points, at)
 
     def lateral(self, t: float, points: Array) -> Array:
-        """Return the distances (m,) of points (m, 2) to the left of the way, seen in the vehicle frame at t.
+        """Distances (m,) of points (m, 2) to the left of the way, seen in the vehicle frame at t.
 
         Each is measured on the stretch around the vehicle that is within its range, as the way may come near
         again later. It is NaN of a point before the begin of the way or beyond its end.

@@ -1,4 +1,4 @@
-"""A record in any order as a log, and arriving messages as cycles; what was left out is counted."""
+"""Convert a record in any order to a log, and arriving messages to cycles; count what is dropped."""
 
 from bisect import insort
 from collections import Counter, deque
@@ -47,19 +47,19 @@ class Recording:
 
 
 def twists_between(t: Array, poses: Array) -> Array:
-    """Return the constant twists (n - 1, 3) that lead from each pose (n, 3) at t (n,) in s to the next."""
+    """Constant twists (n - 1, 3) that lead from each pose (n, 3) at t (n,) in s to the next."""
     moves = [relative(one, other) for one, other in pairwise(poses)]
     logarithms = np.array([gtsam.Pose2.Logmap(gtsam.Pose2(*move)) for move in moves]).reshape(-1, 3)
     return logarithms / np.diff(t)[:, None]
 
 
 def rate(count: int, seconds: float) -> str:
-    """Return in words how often something came in a time (s), which may be none."""
+    """Rate of something in words, unknown where no time (s) passed."""
     return f"{count / seconds:.3g} Hz" if count > 1 and seconds > SHORTEST else "an unknown rate"
 
 
 def clock_falls(t: Array) -> Array:
-    """Return by how much each stamp (n,) in s falls where the clock was reset; elsewhere 0.
+    """Fall of each stamp (n,) in s where the clock was reset; elsewhere 0.
 
     Two messages before it and two from it on agree, unlike those of a stray stamp. Messages out of order fall
     by less than `MAX_DISORDER`.
@@ -74,7 +74,7 @@ def clock_falls(t: Array) -> Array:
 
 
 def elapsed(t: Array) -> Array:
-    """Return stamps (n,) in s of a clock that goes on by `PAUSE` where this one falls."""
+    """Stamps (n,) in s of a clock that advances by `PAUSE` where this one falls."""
     falls = clock_falls(t)
     return np.asarray(t + np.cumsum(falls + PAUSE * (falls > 0.0)))
 
@@ -99,7 +99,7 @@ def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None
 
 
 def windowed(record: Recording, window: Window, file: Path) -> Recording:
-    """Return the part of a record that counts."""
+    """Cut a record to the window."""
     notes, record = record.notes, _near(record, window.range_max, record.notes)
     scan_t = record.scan_t + window.time_offset
     clocks = elapsed(record.t), elapsed(scan_t)
@@ -119,7 +119,7 @@ def windowed(record: Recording, window: Window, file: Path) -> Recording:
 
 
 def _near(record: Recording, most: float | None, notes: Counter[str]) -> Recording:
-    """Return a record without detections farther than `most` from the sensor (m), if it is given."""
+    """Drop detections farther than `most` from the sensor (m), if it is given."""
     if most is None:
         return record
     with np.errstate(over="ignore"):
@@ -132,9 +132,9 @@ def _near(record: Recording, most: float | None, notes: Counter[str]) -> Recordi
 def to_log(
     record: Recording, frames: Frames, noise: NoiseSettings, file: Path, spacing: float | None = None
 ) -> Log:
-    """Return a record in order of time, in the vehicle frame; InputError of `file` if nothing is usable.
+    """Convert a record to a log; InputError of `file` if nothing is usable.
 
-    Points of lines are a spacing (m) apart, by default one that they tell themselves.
+    Points of lines are a spacing (m) apart, by default a share of their median range.
     """
     frames = replace(frames, mounting=frames.mounting or record.mounting)
     odometry = _odometry(record, frames, file)
@@ -158,7 +158,7 @@ def _with_lines(record: Recording, odometry: Odometry, frames: Frames, spacing: 
 
 
 def _without_lines(record: Recording) -> Recording:
-    """Return a record of points that stand alone, without polylines beside them."""
+    """Drop polylines beside points that stand alone."""
     scans = [scan.where(scan.lines == ALONE) for scan in record.scans]
     notes, left_out = record.notes, count(record.scans) - count(scans)
     notes["points of polylines beside cones were left out (--spacing takes both as lines)"] += left_out
@@ -258,7 +258,7 @@ def usable(points: Points, notes: Counter[str]) -> Points:
 def in_vehicle_frame(
     t: float, found: Points, frames: Frames, noise: NoiseSettings, notes: Counter[str]
 ) -> Detections:
-    """Return detections as a perception cycle in the vehicle frame.
+    """Make a perception cycle of detections, in the vehicle frame.
 
     A point `q` with covariance `K` is at `R(yaw) q + (x, y)` with `R K R^T`. Where a covariance is missing or
     not positive definite, it is made from range and bearing at the sensor.
@@ -275,7 +275,7 @@ def in_vehicle_frame(
 
 
 def positive_definite(covariances: Array) -> BoolArray:
-    """Return which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
+    """Which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
     xx, xy, yx, yy = covariances.reshape(-1, 4).T
     with np.errstate(over="ignore", invalid="ignore"):
         good = np.isfinite(covariances).all(axis=(1, 2)) & is_positive_definite(xx, xy, yy)

@@ -1,4 +1,4 @@
-"""What a record does not say of itself: noise, where the sensor is mounted, and which way y points."""
+"""What a record does not state: noise, the mounting of the sensor, and the direction of y."""
 
 import re
 from collections import Counter
@@ -80,13 +80,13 @@ class NoiseSettings(Checked, group=""):
 
     @property
     def sigmas(self) -> tuple[float, ...]:
-        """Return sigmas of the range at range 0 (m), of its growth (m/m), and of the bearing (rad)."""
+        """Sigmas of the range at range 0 (m), of its growth (m/m), and of the bearing (rad)."""
         pairs = zip(self._own, SIGMA_DETECTIONS, strict=True)
         return tuple(default if own is None else own for own, default in pairs)
 
     @property
     def states_detections(self) -> bool:
-        """Return whether the noise of the detections is stated here."""
+        """Whether the noise of the detections is stated here."""
         return any(own is not None for own in self._own)
 
 
@@ -110,12 +110,12 @@ class Frames(Checked, group=""):
 
     @property
     def sides(self) -> NDArray[np.float64]:
-        """Return by what a point [x, y] (2,) of the sensor is multiplied, so that y points to the left."""
+        """Signs (2,) of a sensor's point [x, y] that make y point to the left."""
         return np.array([1.0, 1.0 if self.y == "left" else -1.0])
 
     @property
     def flip(self) -> NDArray[np.float64]:
-        """Return by what a twist [vx, vy, wz] (3,) is multiplied, so that its y axis points to the left."""
+        """Signs (3,) of a twist [vx, vy, wz] that make its y axis point to the left."""
         return np.array([1.0, 1.0, 1.0] if (self.y_odometry or self.y) == "left" else [1.0, -1.0, -1.0])
 
 
@@ -162,7 +162,7 @@ class LabelRule:
             self._labels[value] = NAMES.index(name)
 
     def of(self, value: Any, times: int = 1) -> int:
-        """Return the label of a value met so often: a number, a text, or a colour with `r`, `g` and `b`."""
+        """Label a value that was met so often: a number, a text, or a colour with `r`, `g` and `b`."""
         value = getattr(value, "data", value)
         if hasattr(value, "r") and hasattr(value, "g") and hasattr(value, "b"):
             r, g, b = (float(channel) for channel in (value.r, value.g, value.b))
@@ -178,13 +178,13 @@ class LabelRule:
         return np.array([*map(self.of, texts.tolist(), counts.tolist())], dtype=int)[place]
 
     def told(self) -> str:
-        """Return in a line what the most frequent values were taken for; empty where there are none."""
+        """One line with the labels of the most frequent values; empty where there are none."""
         most = self.met.most_common(MOST_TOLD)
         values = [f"{text or 'empty'} is {NAMES[label]} ({count})" for (text, label), count in most]
         return f"labels: {', '.join(values)}{', ...' * (len(self.met) > len(most))}" if values else ""
 
     def hint(self) -> str:
-        """Return which values may mean a side that nobody has said; empty where there are none."""
+        """Hint at values that may mean a side; empty where there are none."""
         unknown = [text for (text, label), _ in self.met.most_common() if label == UNKNOWN]
         unmapped = [text for text in unknown if label_words(text).isdisjoint(UNKNOWN_WORDS) and text]
         told = f"labels {', '.join(unmapped[:MOST_TOLD])} are taken for unknown"
@@ -192,7 +192,7 @@ class LabelRule:
 
 
 def _whole(text: str) -> str:
-    """Return the text of a whole number as `1`, also where it is written as `1.0`; else the text."""
+    """Text of a whole number as `1`, also where it is written as `1.0`; else the text."""
     try:
         number = float(text)
     except ValueError:
@@ -201,12 +201,12 @@ def _whole(text: str) -> str:
 
 
 def label_words(text: str) -> set[str]:
-    """Return the words of a text in lower case: those of `Blue-cone` are blue and cone."""
+    """Words of a text in lower case: those of `Blue-cone` are blue and cone."""
     return set(re.findall(r"[a-z]+", text.lower()))
 
 
 def label_of_words(text: str) -> int:
-    """Return the label of a text by its words; UNKNOWN where none or several are of a side."""
+    """Label of a text by its words; UNKNOWN where none or several are of a side."""
     words = label_words(text)
     if words & ORANGE_WORDS:
         return BIG_ORANGE if words & BIG_WORDS else ORANGE
@@ -215,7 +215,7 @@ def label_of_words(text: str) -> int:
 
 
 def label_of_colour(red: float, green: float, blue: float) -> int:
-    """Return the label of a blue, yellow or orange colour, UNKNOWN of any other; the scale is free."""
+    """Label of a blue, yellow or orange colour, UNKNOWN of any other; the scale is free."""
     most, least = max(red, green, blue), min(red, green, blue)
     if not 0.0 < most < inf or not most - least > MIN_SATURATION * most:
         return UNKNOWN

@@ -61,7 +61,7 @@ MAX_PERIOD: Final = 1e3  # largest mean period of samples (s); more is a wrong u
 def read_csv(
     odometry: Path, detections: Path, rule: LabelRule, columns: Sequence[str] = (), units: Sequence[str] = ()
 ) -> Recording:
-    """Return what two CSV files have of a drive; an InputError names file, row and column.
+    """Read the drive in two CSV files; an InputError names file, row and column.
 
     Quantities are in columns of their own names, unless `columns` says `vx=speed`, `y=-cone_y` or
     `odometry.t=stamp`, and in SI units, unless `units` says `length=mm angle=deg time=ns`. Stamps may be ISO
@@ -81,7 +81,7 @@ def read_csv(
 
 
 def _named(pairs: Sequence[str]) -> dict[tuple[str, str], str]:
-    """Return columns by kind of file and quantity, with a minus where the sign changes."""
+    """Columns by kind of file and quantity, with a minus where the sign changes."""
     named: dict[tuple[str, str], str] = {}
     for pair in pairs:
         key, equals, name = pair.partition("=")
@@ -95,7 +95,7 @@ def _named(pairs: Sequence[str]) -> dict[tuple[str, str], str]:
 
 
 def _units(pairs: Sequence[str]) -> dict[str, str]:
-    """Return the units of the quantities; those of a `speed` and a `yaw_rate` follow the others."""
+    """Units of the quantities; those of a `speed` and a `yaw_rate` follow the others."""
     names = {"time": "s", "length": "m", "angle": "rad"}
     for pair in pairs:
         quantity, equals, unit = pair.partition("=")
@@ -121,11 +121,11 @@ class _File:
             raise InputError(self.table.file, "expected at least one row, found a header only", 2)
 
     def has(self, key: str) -> bool:
-        """Return whether the file has the column of a quantity; one that was named must be there."""
+        """Whether the file has the column of a quantity; one that was named must be there."""
         return (self.kind, key) in self.named or key in self.table.columns
 
     def column(self, key: str, column: str = "") -> str:
-        """Return the column of a quantity, which must be there; it may be one of several `column`s."""
+        """Column of a quantity, which must be there; it may be one of several `column`s."""
         column = column or self.named.get((self.kind, key), key).removeprefix("-")
         if column not in self.table.columns:
             otherwise = f", or {key}=SECONDS+NANOSECONDS" * (key == "t")
@@ -135,14 +135,14 @@ class _File:
         return column
 
     def numbers(self, key: str, power: int = 1) -> Array:
-        """Return a column (rows,) in the SI unit or, for `power` 2, its square; NaN where it is missing."""
+        """A column (rows,) in the SI unit or, for `power` 2, its square; NaN where it is missing."""
         quantity = QUANTITIES[self.kind][key]
         sign = -1.0 if self.named.get((self.kind, key), "").startswith("-") else 1.0
         factor = sign * UNITS[quantity][self.units[quantity]] ** power
         return np.asarray(factor * self.table.numbers(self.column(key), LARGEST, missing=True))
 
     def stamps(self) -> Array:
-        """Return the stamps (rows,) in s: numbers, dates, or seconds and nanoseconds in two columns."""
+        """Stamps (rows,) in s: numbers, dates, or seconds and nanoseconds in two columns."""
         stated, unit = self.named.get((self.kind, "t"), "t"), self.units["time"]
         if "+" in stated and stated not in self.table.columns:
             return self._checked(self._in_two_columns(*stated.split("+", 1)), "s")
@@ -152,7 +152,7 @@ class _File:
         return self._checked(UNITS["time"][unit] * self.table.numbers(name, LARGEST), unit)
 
     def _in_two_columns(self, whole: str, fraction: str) -> Array:
-        """Return the stamps (rows,) in s of columns with seconds and with nanoseconds."""
+        """Stamps (rows,) in s of columns with seconds and with nanoseconds."""
         seconds, nanoseconds = (
             self.table.numbers(self.column("t", name), LARGEST) for name in (whole, fraction)
         )
@@ -172,7 +172,7 @@ class _File:
         return np.array(seconds, dtype=float)
 
     def _checked(self, t: Array, unit: str) -> Array:
-        """Return stamps (rows,) in s, which must be plausible where they were in this unit."""
+        """Stamps (rows,) in s, which must be plausible where they were in this unit."""
         name = self.named.get((self.kind, "t"), "t")
         self.table.require(
             np.abs(t) <= MAX_STAMP,
@@ -193,7 +193,7 @@ class _File:
 
 
 def seconds_of_date(text: str) -> float | None:
-    """Return the time (s) since 1970 of a date with a time by ISO 8601, UTC without an offset; else None."""
+    """Time (s) since 1970 of a date with a time by ISO 8601, UTC without an offset; else None."""
     text = _BEFORE_ZONE.sub("", text.strip().upper().replace("UTC", "Z"))
     if is_number(text):
         return None
@@ -205,7 +205,7 @@ def seconds_of_date(text: str) -> float | None:
 
 
 def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
-    """Return the stamps of the perception cycles (n,) in s, and the points of each, in the file's order."""
+    """Stamps of the perception cycles (n,) in s, and the points of each, in the file's order."""
     t, points, covariances = file.stamps(), _points(file), None
     labels = np.full(len(t), UNKNOWN)
     if any(map(file.has, COVARIANCE)):
@@ -238,7 +238,7 @@ def _points(file: _File) -> Array:
 
 
 def _without_place(file: _File) -> InputError:
-    """Return the error of detections without x and y, and without range and bearing."""
+    """Error of detections that have neither x and y nor range and bearing."""
     polar = next((key for key in ("range", "bearing") if not file.has(key) and file.has(_OTHER[key])), "")
     either = f"'{polar}' beside {_OTHER[polar]}, or x and y" if polar else "'x' and y, or range and bearing"
     expected = f"expected a column {either} (--columns {polar or 'x'}=NAME)"

@@ -23,7 +23,7 @@ class Brief:
 
 
 def brief(value: Any) -> str:
-    """Return a text of a value on one line, with shapes and lengths in place of many numbers."""
+    """One-line text of a value, with shapes and lengths in place of many numbers."""
     shape = getattr(value, "shape", None)
     if shape is not None and getattr(value, "size", 0) > LONGEST:
         return f"array {shape}"

@@ -17,14 +17,14 @@ def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
 
 
 def polar_covariances(bearings: Array, along: Array, across: Array) -> Array:
-    """Return `R(b) diag(along, across) R(b)^T` (m, 2, 2) of variances (m,) along rays and across them."""
+    """`R(b) diag(along, across) R(b)^T` (m, 2, 2) of variances (m,) along rays and across them."""
     c, s = np.cos(bearings), np.sin(bearings)
     xx, yy = c * c * along + s * s * across, s * s * along + c * c * across
     return covariances_of(xx, c * s * (along - across), yy)
 
 
 def ray_covariances(points: Array, sigmas: Iterable[float]) -> Array:
-    """Return covariances (m, 2, 2) by (s_range, s_growth, s_bearing) of points (m, 2) at ranges r.
+    """Covariances (m, 2, 2) by (s_range, s_growth, s_bearing) of points (m, 2) at ranges r.
 
     `(s_range + s_growth r)^2` along the ray, `(r s_bearing)^2` across it.
     """
@@ -35,7 +35,7 @@ def ray_covariances(points: Array, sigmas: Iterable[float]) -> Array:
 
 
 def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:
-    """Return which covariances (m,) are positive definite, by their entries."""
+    """Which covariances (m,) are positive definite, by their entries."""
     with np.errstate(over="ignore", invalid="ignore"):
         good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
     return np.asarray(good)

@@ -60,12 +60,12 @@ def write_points(file: Path, track: Map, step: float) -> None:
 
 
 def boundary_points(boundary: MapBoundary, step: float) -> Array:
-    """Return points (n, 2) of a boundary about `step` (m) apart along it, or its landmarks."""
+    """Points (n, 2) of a boundary about `step` (m) apart along it, or its landmarks."""
     return boundary.points if isinstance(boundary, PointBoundary) else sampled(boundary.spline, step)
 
 
 def sampled(spline: BSpline, step: float, fewest: int = _FEWEST_INTERVALS) -> Array:
-    """Return points (n, 2) of a curve about `step` (m) apart; the first of a closed one isn't repeated."""
+    """Points (n, 2) of a curve about `step` (m) apart; the first of a closed one isn't repeated."""
     length = spline.length()
     at = np.linspace(0.0, length, max(round(length / step), fewest) + 1)
     return spline.evaluate(spline.parameters_at(at[:-1] if spline.periodic else at))
@@ -99,7 +99,7 @@ class LocalPlane:
                 raise SettingsError(f"origin: expected a {expected} degrees, found {found:g}")
 
     def to_geodetic(self, points_map: Array) -> Array:
-        """Return latitude and longitude (n, 2), in degrees, of points (n, 2) of the map in m."""
+        """Latitude and longitude (n, 2), in degrees, of points (n, 2) of the map in m."""
         sine, cosine = np.sin(np.radians(self.heading)), np.cos(np.radians(self.heading))
         east, north = (points_map @ np.array([[sine, cosine], [-cosine, sine]])).T
         degrees = pymap3d.enu2geodetic(east, north, 0.0 * east, self.latitude, self.longitude, 0.0)
@@ -219,7 +219,7 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
 
 
 def _pieces(spline: BSpline, cuts: Array, step: float) -> list[Array]:
-    """Return the points (n, 2) of each stretch between cuts, without its last one, or of an open curve."""
+    """Points (n, 2) of each stretch between cuts, without its last one, or of an open curve."""
     if not len(cuts):
         return [sampled(spline, step, _FEWEST_WAY_INTERVALS)]
     length, (low, high) = spline.length(), spline.domain

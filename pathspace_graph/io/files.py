@@ -77,7 +77,7 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
 
 
 def is_stream(path: Path) -> bool:
-    """Return whether a path is standard output, a device or a pipe, which can't be replaced."""
+    """Whether a path is standard output, a device or a pipe, which can't be replaced."""
     return path == STDOUT or (path.exists() and not path.is_file() and not path.is_dir())
 
 
@@ -101,7 +101,7 @@ def write_text(file: Path, text: str) -> None:
 
 
 def to_plain(value: Any) -> Any:
-    """Return the value in the types of strict JSON; NaN becomes null, and infinity the text "inf"."""
+    """Convert a value to the types of strict JSON; NaN becomes null, and infinity the text "inf"."""
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):

@@ -73,14 +73,14 @@ class Odometry(Brief):
     """Twists [vx, vy, wz] (N, 3) in m/s, m/s, rad/s, vehicle frame."""
 
     def between(self, start: float, end: float) -> Odometry:
-        """Return the twists in force from `start` (s) to `end` (s); before the first row nothing moves."""
+        """Twists in force from `start` (s) to `end` (s); before the first row nothing moves."""
         start = max(start, float(self.t[0]))
         first = int(np.searchsorted(self.t, start, side="right")) - 1
         stop = max(first, int(np.searchsorted(self.t, end, side="left"))) if end > start else first
         return Odometry(np.maximum(self.t[first:stop], start), self.twist[first:stop])
 
     def followed_by(self, later: Odometry) -> Odometry:
-        """Return these twists and the later ones that are newer."""
+        """Append the later twists that are newer."""
         new = later.t > self.t[-1] if len(self.t) else np.ones(len(later.t), bool)
         return Odometry(np.append(self.t, later.t[new]), np.concatenate([self.twist, later.twist[new]]))
 
@@ -106,7 +106,7 @@ class Detections(Brief):
         return Detections(self.t, self.points_vehicle[chosen], self.covariances[chosen], self.labels[chosen])
 
     def with_others(self, other: Detections) -> Detections:
-        """Return these detections followed by other ones of the same cycle."""
+        """Append other detections of the same cycle."""
         names = ("points_vehicle", "covariances", "labels")
         return Detections(
             self.t, *(np.concatenate([getattr(of, name) for of in (self, other)]) for name in names)
@@ -199,7 +199,7 @@ class Log:
         )
 
     def plot(self, **options: Any) -> Figure:
-        """Return a picture of the log; the options are those of `eval.figures.map_plot.plot_log`."""
+        """Draw the log; the options are those of `eval.figures.map_plot.plot_log`."""
         figure: Figure = pictures().plot_log(self, **options)
         return figure
 
@@ -216,7 +216,7 @@ class Log:
         odometry_sigma: ArrayLike | None = None,
         kind: Kind | None = None,
     ) -> Log:
-        """Return the log of body twists (N, 3) at t (N,) and of points (m, 2) detected at detection_t (m,).
+        """Make the log of body twists (N, 3) at t (N,) and of points (m, 2) detected at detection_t (m,).
 
         Units are s, m and rad, points are in the vehicle frame, and each twist is held until the next.
         Detections of one stamp are one cycle. A label is a number or a word, by default unknown.
@@ -265,7 +265,7 @@ def read_log(folder: Path | str) -> Log:
 
 
 def _table(folder: Path, name: str) -> Table:
-    """Return a table of a log; one of the truth that is not known has no rows."""
+    """Read a table of a log; an unknown one of the truth has no rows."""
     if name in TRUTH_FILES and not (folder / name).exists():
         return Table.of_arrays(folder / name, COLUMNS[name], np.zeros((0, len(COLUMNS[name]))))
     return read_table(folder / name, COLUMNS[name])
@@ -325,7 +325,7 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
 
 
 def cycles_of(t: Array, points: Array, covariances: Array, labels: IntArray) -> tuple[Detections, ...]:
-    """Return the perception cycles of detections (m,) at stamps (s), see `is_one_cycle`."""
+    """Group detections (m,) at stamps (s) to perception cycles, see `is_one_cycle`."""
     starts: list[int] = []
     for row, stamp in enumerate(t.tolist()):
         if not starts or not is_one_cycle(stamp, t[starts[-1]]):
@@ -335,7 +335,7 @@ def cycles_of(t: Array, points: Array, covariances: Array, labels: IntArray) -> 
 
 
 def is_one_cycle(t: float, begin: float) -> bool:
-    """Return whether detections at t (s) belong to the cycle that begins at a stamp (s), and has that stamp.
+    """Whether detections at t (s) belong to the cycle that begins at a stamp (s), and has that stamp.
 
     Several cameras, and stamps that were rounded to milliseconds, differ by `MIN_INTERVAL` or less.
     """

@@ -45,7 +45,7 @@ def write_trajectory(file: Path, t: ArrayLike, poses: ArrayLike) -> None:
 
 
 def read_trajectory(file: Path) -> tuple[Array, Array]:
-    """Return stamps (n,) in s and poses [x, y, theta] (n, 3), map frame; an InputError names a wrong row."""
+    """Read stamps (n,) in s and poses [x, y, theta] (n, 3), map frame; an InputError names a wrong row."""
     lines = enumerate(read_text(file, "a trajectory").split("\n"), start=1)
     rows = [_values(file, line, n) for n, line in lines if line.strip() and not line.startswith("#")]
     values = np.array(rows).reshape(-1, _COLUMNS)
@@ -135,7 +135,7 @@ class VehicleState(Brief):
 
     @property
     def by_name(self) -> dict[str, tuple[float, float]]:
-        """Return each calibration with its standard deviation, by its name in `CALIBRATION` and `SENSOR`."""
+        """Each calibration with its standard deviation, by its name in `CALIBRATION` and `SENSOR`."""
         values = np.append(self.calibration, self.sensor).tolist()
         of_sensor = np.sqrt(np.diag(self.sensor_covariance))
         sigmas = np.append(self.sigmas[len(self.pose) :], of_sensor).tolist()
@@ -143,14 +143,14 @@ class VehicleState(Brief):
 
     @classmethod
     def split(cls, pose: Array, calibrations: Array, joint: Array) -> VehicleState:
-        """Return the state of a joint covariance of [pose | calibration of odometry | of sensor]."""
+        """Split the state of a joint covariance of [pose | calibration of odometry | of sensor]."""
         known = len(pose) + CALIBRATION_SIZE
         odometry, sensor = np.split(calibrations.copy(), [CALIBRATION_SIZE])
         return cls(pose.copy(), odometry, joint[:known, :known], sensor, joint[known:, known:])
 
     @property
     def sigmas(self) -> Array:
-        """Return the standard deviations (5,) of [pose | calibration]."""
+        """Standard deviations (5,) of [pose | calibration]."""
         return np.sqrt(np.diag(self.covariance))
 
 
@@ -228,18 +228,18 @@ class RunResult:
         return f"{name},\n    {self.map})"
 
     def to_frame(self) -> pd.DataFrame:
-        """Return the run as a frame: a row for each cycle, as in `cycles.csv`, with its pose x, y, theta."""
+        """Convert the run to a frame: a row for each cycle, as in `cycles.csv`, with its pose x, y, theta."""
         frame: pd.DataFrame = frames().run_frame(self)
         return frame
 
     def plot(self, **options: Any) -> Figure:
-        """Return a picture of map and trajectory; the options are those of `Map.plot`."""
+        """Draw map and trajectory; the options are those of `Map.plot`."""
         health = [record.health for record in self.cycles]
         paths = {"trajectory": self.trajectory, "smoothed": self.smoothed}
         return self.map.plot(**paths, health=health, **options)
 
     def at_scale_one(self) -> Self:
-        """Return the result of a scene that is as large as a Formula Student track."""
+        """Rescale the result to the size of a Formula Student track."""
         return scaled(self, 1.0 / self.scale)
 
 

@@ -38,7 +38,7 @@ class Simulate:
 
     @classmethod
     def base(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of the presets, before any other option is set."""
+        """Settings of the presets, before any other option is set."""
         return {"settings": preset({group: given[group] for group in PRESETS if group in given})}
 
 

@@ -26,7 +26,7 @@ class Estimation:
 
     @classmethod
     def base(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of the file, before any other option is set."""
+        """Settings of the file, before any other option is set."""
         if "settings" not in given:
             return {}
         overrides = import_module("pathspace_graph.io.overrides")  # the help need not wait for NumPy

@@ -69,7 +69,7 @@ def _types(settings: Any) -> dict[str, tuple[Any, str]]:
 
 
 def is_of(value: Any, kind: Any) -> bool:
-    """Return whether a value is of the type of a field; NumPy's numbers are numbers."""
+    """Whether a value is of the type of a field; NumPy's numbers are numbers."""
     options = get_args(kind)
     if get_origin(kind) in (Union, UnionType):
         return any(is_of(value, option) for option in options)

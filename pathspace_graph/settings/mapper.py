@@ -276,7 +276,7 @@ ODOMETRY_SIGMA = (0.25, 0.12, 0.035)
 
 
 def known_settings(settings: MapperSettings | None) -> MapperSettings:
-    """Return the settings of an estimator, by default the defaults; SettingsError for anything else."""
+    """Settings of an estimator, by default the defaults; SettingsError for anything else."""
     settings = MapperSettings() if settings is None else settings
     check_type("settings", settings, MapperSettings)
     return settings

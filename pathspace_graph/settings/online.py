@@ -56,7 +56,7 @@ class ClosingSettings(Checked):
     iterations: ClassVar[int] = 2  # Gauss-Newton steps after the loop is found, and after simplification
 
     def radius_after(self, length: float) -> float:
-        """Return the distance from the first stretch within which the loop may close after a length (m)."""
+        """Distance from the first stretch within which the loop may close after a length (m)."""
         return self.radius + self.drift * length
 
 
@@ -123,7 +123,7 @@ class _Priors(Checked):
         return tuple(getattr(self, f"sigma_{name}") for name in self.ERRORS if self.sensor)
 
     def about(self, errors: Iterable[float]) -> Self:
-        """Return the priors with other means: errors in the order of `means`, or none."""
+        """Replace the means: errors in the order of `means`, or none."""
         return replace(self, **dict(zip(self.ERRORS, errors, strict=False)))  # type: ignore[type-var]
 
 
@@ -152,16 +152,16 @@ class OdometrySettings(_Priors):
 
     @property
     def sigmas(self) -> tuple[float, ...]:
-        """Return standard deviations of the priors; a scale that is held is as good as known."""
+        """Standard deviations of the priors; a scale that is held is as good as known."""
         return self.sigma_scale * (HELD if self.hold_scale else 1.0), self.sigma_bias
 
     @property
     def sigma_size(self) -> float:
-        """Return the standard deviation of the size of the world, where it is no variable (-)."""
+        """Standard deviation of the size of the world, where it is no variable (-)."""
         return self.sigma_scale if self.hold_scale else 0.0
 
     def widened(self) -> Self:
-        """Return the settings of wide priors, which are not doubted again."""
+        """Widen the priors, which are not doubted again."""
         scale = self.sigma_scale if self.hold_scale else WIDE_ODOMETRY * self.sigma_scale
         return replace(self, doubt=inf, sigma_scale=scale, sigma_bias=WIDE_ODOMETRY * self.sigma_bias)
 
@@ -201,7 +201,7 @@ class CalibrationSettings(_Priors):
     """Contradiction from which the priors become wide, standard deviations; `inf` to hold them always."""
 
     def widened(self) -> Self:
-        """Return the settings of wide priors, which are not doubted again.
+        """Widen the priors, which are not doubted again.
 
         The scale of the ranges keeps its own, or the size of the map would rest on the wheels alone.
         """
