@@ -77,7 +77,7 @@ class OdometryFaults(Checked, group="faults.odometry"):
     false_travel: AtLeast0 = 0.0
     """Speed (m/s) below which the odometry doesn't fall while the vehicle brakes to its last stand."""
     false_travel_time: AtLeast0 = 3.0
-    """Time for which it goes on so while the vehicle stands (s)."""
+    """Time for which this continues while the vehicle stands (s)."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class VehicleFaults(Checked, group="faults.vehicle"):
     """Laps after which the vehicle is carried."""
     wrong_way: bool = False
     """Whether a closed track is driven the other way round, so that the blue cones are on the right. The
-    truth calls the boundary on the left of the way driven the left one."""
+    left boundary of the truth is the one on the left of the vehicle."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A sensor of lines, kerbs or walls: points of both boundaries, at other places in each cycle."""
+"""A sensor of lines, kerbs or walls: points of both boundaries, at different places in each cycle."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _true_points(cones: Array, closed: bool) -> Array:
 
 
 class LineSensor:
-    """Points anywhere along both boundaries, drawn anew in each cycle, so that none is met twice.
+    """Points anywhere along both boundaries, drawn independently in each cycle.
 
     A covariance is that of the noise of range and bearing, and of the scatter across the boundary: the
     variance of the distance across is exact. Along the boundary a point lies anywhere, and the covariance

@@ -72,7 +72,7 @@ class SimulationSettings(Checked, group=""):
         }
         for group, values in known.items():
             if attrgetter(group)(self) not in values:
-                raise SettingsError(f"draw: expected no setting of {group} beside it, as it is drawn")
+                raise SettingsError(f"draw: expected no setting of {group} beside it, since it is drawn")
 
     def with_car(self, car: DrawnCar) -> Self:
         """Replace the car by a drawn one."""

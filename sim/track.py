@@ -36,7 +36,7 @@ class Track:
 
     @property
     def rows(self) -> tuple[Array, Array]:
-        """The cones of the left and of the right boundary as they are passed, those of each round anew."""
+        """Cones of the left and the right boundary in passing order, repeated in each round."""
         if self.closed or self.path is None:
             return self.left, self.right
         return _passed(self.left, self.path), _passed(self.right, self.path)

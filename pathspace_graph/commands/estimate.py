@@ -1,4 +1,4 @@
-"""`online` and `batch`: a log is mapped cycle by cycle, without reading ahead, or optimized at once."""
+"""`online` and `batch`: map a log cycle by cycle, without reading ahead, or optimize it at once."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -264,7 +264,7 @@ def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> d
 
 
 def tell(hints: Sequence[Hint], of: str = "") -> None:
-    """Print a line for each hint as an error, with the name of the log `of` which it is, if given."""
+    """Print a line for each hint on standard error, with the name of its log, if given."""
     note(*(f"hint: {of}{'/' if of else ''}{hint.line}" for hint in hints))
 
 
@@ -279,7 +279,7 @@ def map_online(
 
 
 def report(result: RunResult, log: Log) -> None:
-    """Print the run, the paper's table where there is truth, and as an error what was not mapped."""
+    """Print the run, the paper's table where there is truth, and on standard error what was not mapped."""
     if laps := laps_of(result, log):
         output().print(laps_table(laps))
     say(outline(result), *kind_lines(result))

@@ -40,7 +40,7 @@ class KnownTrack:
         return [scaled(one, result.scale) for one in found]
 
     def summary(self, estimator: OnlineEstimator, differ: list[MapDifference]) -> dict[str, Any]:
-        """What `summary.json` says about the map."""
+        """Entries of `summary.json` about the map."""
         known = {"map": str(self.path), "found_at": self.found_at(estimator)}
         return {"known_map": known, "differences": [asdict(one) for one in differ]}
 

@@ -17,14 +17,14 @@ from .messages import ALONE, Points
 from .settings import LEAST_SPACING, Frames
 
 SPACING_SHARE: Final = 0.15  # spacing by the median range, which has the size of the scene
-WALL_SAMPLES: Final = 1_000_000  # of the way driven
-WALL_STRETCH: Final = 2.0  # reach along the way, before and behind, by the range of a point
-WALL_FARTHEST: Final = 3.0  # of a point of a boundary from the way, by the distance of the median point
-NEXT_LINE: Final = 1.5  # distance of a polyline from the way by that of the nearest one on its side
+WALL_SAMPLES: Final = 1_000_000  # of the driven path
+WALL_STRETCH: Final = 2.0  # reach along the path, ahead and behind, in ranges of the point
+WALL_FARTHEST: Final = 3.0  # distance of a boundary point from the path, in distances of the median point
+NEXT_LINE: Final = 1.5  # distance of a polyline from the path, in distances of the nearest one on its side
 
 
 def are_lines(scans: list[Points], spacing: float | None) -> bool:
-    """Whether a record has points of lines: it has a stated spacing, or no point that stands alone."""
+    """Whether a record has points of lines: a spacing is stated, or no point stands alone."""
     lines = np.concatenate([np.zeros(0, int), *(scan.lines for scan in scans)])
     return spacing is not None or bool(len(lines) and (lines != ALONE).all())
 
@@ -62,7 +62,7 @@ def lines_of(
             [scan.labels != UNKNOWN, away > 0.0, away < 0.0], [scan.labels, LEFT, RIGHT], UNKNOWN
         )
         result.append(scan._replace(labels=labels).where(near & ~(np.abs(away) > limit)))
-    notes["points of lines were too far from the way driven, and were left out"] += count(found) - count(
+    notes["points of lines were too far from the driven path, and were left out"] += count(found) - count(
         result
     )
     return result
@@ -79,13 +79,13 @@ def in_vehicle(points: Array, frames: Frames) -> Array:
 
 
 def farthest(lateral: Array) -> float:
-    """Largest distance (m) of a boundary from the way, by all lateral distances (m,)."""
+    """Largest distance (m) of a boundary from the path, by all lateral distances (m,)."""
     known = np.abs(lateral[np.isfinite(lateral)])
     return WALL_FARTHEST * float(np.median(known)) if len(known) else np.inf
 
 
 def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
-    """Which points (m,) are of the polylines nearest to the way on their side, or of none."""
+    """Which points (m,) are of the polylines nearest to the path on their side, or of none."""
     kept = np.ones(len(lines), bool)
     numbers = np.unique(lines[lines >= 0])
     middles = np.array([np.nanmedian(lateral[lines == line]) for line in numbers])
@@ -117,7 +117,7 @@ def resampled(vertices: Array, spacing: float) -> Array:
 def thinned(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
     """Indices of chosen points (m, 2) no two of which are nearer than the spacing (m).
 
-    They are taken by bearing: by range, the noise of the ranges would decide which of some points is kept.
+    They are chosen by bearing, since by range the noise of the ranges would choose.
     """
     left = np.flatnonzero(chosen)
     left = left[np.argsort(np.arctan2(points[left, 1], points[left, 0]), kind="stable")]
@@ -130,12 +130,12 @@ def thinned(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
 
 @dataclass(frozen=True, eq=False)
 class DrivenWay:
-    """The way driven by dead reckoning from the pose at the first twist."""
+    """The path driven, by dead reckoning from the pose at the first twist."""
 
     t: Array  # (N,) stamps (s)
     poses: Array  # (N, 3) poses in m, m and rad
     s: Array  # (N,) path length (m)
-    points: Array  # (k, 2) points of the way, at even distances
+    points: Array  # (k, 2) points of the path, evenly spaced
     at: Array  # (k,) their path lengths (m)
 
     @classmethod
@@ -149,10 +149,10 @@ class DrivenWay:
         return cls(odometry.t, poses, s, points, at)
 
     def lateral(self, t: float, points: Array) -> Array:
-        """Distances (m,) of points (m, 2) to the left of the way, seen in the vehicle frame at t.
+        """Distances (m,) of points (m, 2) to the left of the path, seen in the vehicle frame at t.
 
-        Each is measured on the stretch around the vehicle that is within its range, as the way may come near
-        again later. It is NaN of a point before the begin of the way or beyond its end.
+        Each is measured on the stretch around the vehicle within its range, since the path may return later.
+        A point before the beginning or beyond the end of the path has NaN.
         """
         x, y, heading, here = (np.interp(t, self.t, of) for of in (*self.poses.T, self.s))
         placed = points @ rotation(float(heading)).T + np.array([x, y])

@@ -25,8 +25,8 @@ from .settings import Frames, LabelRule, NoiseSettings, Window
 
 MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
 MAX_DISORDER: Final = 2.0  # largest fall of stamps (s) from one message to the next of one clock
-SHORTEST: Final = 1e-6  # time (s) in which nothing has a rate; a bag of one message has 1 ns
-PAUSE: Final = 1.0  # time (s) that is counted where a clock was reset
+SHORTEST: Final = 1e-6  # least time (s) that gives a rate; a bag of one message has 1 ns
+PAUSE: Final = 1.0  # time (s) assumed to pass where a clock was reset
 # notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
@@ -35,14 +35,14 @@ SHARED: Final = "messages with detections are at most 1 ms after another one, an
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a record has of a drive, in its own order and its own frames."""
+    """Drive as it was recorded, in its own order and frames."""
 
     t: Array  # (N,) stamps of the twists (s)
     twists: Array  # (N, 3) twists in m/s, m/s and rad/s
     scan_t: Array  # (M,) stamps of the messages with detections (s)
-    scans: list[Points]  # detections of each message, in the frame of the sensor
-    source: dict[str, str]  # where the record comes from, in words
-    notes: Counter[str] = field(default_factory=Counter)  # what was done, in words, with the number of times
+    scans: list[Points]  # detections of each message, sensor frame
+    source: dict[str, str]  # origin of the record, in words
+    notes: Counter[str] = field(default_factory=Counter)  # what was done, in words, and how often
     mounting: tuple[float, float, float] | None = None  # sensor's pose (m, m, rad), where it is stated
 
 
@@ -80,7 +80,7 @@ def elapsed(t: Array) -> Array:
 
 
 def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None, begin: float = 0.0) -> None:
-    """Raise an InputError where stamps (n,) in s fall back between `chosen` messages, with a way out.
+    """Raise an InputError where stamps (n,) in s fall back between `chosen` messages.
 
     The options `--start` and `--end` count from `begin` (s) on, as `elapsed` does.
     """
@@ -94,7 +94,7 @@ def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None
     fall = f"the stamps fall back by {t[before] - t[at]:.3g} s at message {at + 1}"
     found = f"found that {fall}, from {t[before]:.12g} s to {t[at]:.12g} s: was the clock reset?"
     parts = f"--end {cut:.1f} takes what is before, --start {cut:.1f} what is after it"
-    way_out = f"{parts}, and --received the times at which the messages of a bag were received"
+    way_out = f"{parts}; --received takes the times of receipt"
     raise InputError(file, f"expected {what} by one clock, {found} {way_out}")
 
 
@@ -104,7 +104,9 @@ def windowed(record: Recording, window: Window, file: Path) -> Recording:
     scan_t = record.scan_t + window.time_offset
     clocks = elapsed(record.t), elapsed(scan_t)
     begin = float(np.nanmin(clocks[0], initial=np.inf))
-    is_cut = window.start > 0.0 or window.end < np.inf  # else stamps that are not finite stay to be counted
+    is_cut = (
+        window.start > 0.0 or window.end < np.inf
+    )  # else keep stamps that are not finite, which are counted later
     kept, seen = (
         (t >= begin + window.start) & (t <= begin + window.end) if is_cut else np.ones(len(t), bool)
         for t in clocks
@@ -284,14 +286,13 @@ def positive_definite(covariances: Array) -> BoolArray:
     return np.asarray(good)
 
 
-MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle, the newest ones
+MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle
 
 
 class MessageStream:
     """Buffer of messages, which gives cycles in order, each with its twists; refused ones are counted.
 
-    A cycle waits for older ones until a message is newer by `wait` (s), as an estimator takes none that is
-    late.
+    A cycle waits for older ones until a message is newer by `wait` (s), since estimators refuse late ones.
     """
 
     def __init__(self, frames: Frames | None = None, wait: float = 0.0) -> None:
@@ -342,6 +343,6 @@ class MessageStream:
         return Odometry(np.array([stamp for stamp, _ in rows]), twists), cycle
 
     def use(self, t: float) -> None:
-        """Drop the twists that a cycle at t (s) has used, but for the last one, which is held."""
+        """Drop the twists that a cycle at t (s) has used, except the last one, which is held."""
         while len(self._twists) > 1 and self._twists[1][0] <= t:
             self._twists.popleft()

@@ -19,22 +19,22 @@ from pathspace_graph.settings.checked import AT_LEAST_0, POSITIVE, AtLeast0, Che
 Side = Literal["left", "right"]  # side of the x axis to which the y axis points
 # fields of a message that may hold the label of a detection, the first one that is there
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
-NO_LABEL: Final = "none"  # name of a label field that says there are no labels
+NO_LABEL: Final = "none"  # name of a label field that means no labels
 LEAST_SPACING: Final = 1e-3  # of points along a line (m)
-DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers where nothing else is said
+DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers by default
 SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
 ORANGE_WORDS: Final = {"orange", "o"}
 BIG_WORDS: Final = {"big", "large"}
 # words of values that mean no side, and of colours, whose hue has decided
 UNKNOWN_WORDS: Final = {"unknown", "none", "other", "undefined", "uncolored", "colourless", "colour"}
-MOST_TOLD: Final = 12  # number of values of labels that a line lists
+MOST_SHOWN: Final = 12  # number of label values in a line
 HUES: Final = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)}  # in degrees
 MIN_SATURATION: Final = 0.3  # least saturation of a colour that is not grey
 
 
 @dataclass(frozen=True)
 class BagOptions:
-    """Which messages of a bag are taken, and how."""
+    """Which messages of a bag are read, and how."""
 
     odometry: str | None = None
     """Topic of the odometry in a bag: any message with a twist, with a speed (then --imu or --wheelbase gives
@@ -53,7 +53,7 @@ class BagOptions:
     from_poses: bool = False
     """Make the twists from the poses of the odometry, for a publisher that leaves its twist zero."""
     received: bool = False
-    """Take the times at which messages were received as stamps, also where they have one of their own."""
+    """Use the times of receipt as stamps, even where messages have their own."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class NoiseSettings(Checked, group=""):
     sigma_odometry: Annotated[tuple[float, float, float] | None, POSITIVE] = None
     """Each sample of [vx, vy, wz] has these standard deviations (m/s, m/s, rad/s), white from sample to
     sample. Without them they are 0.25, 0.12 and 0.035, or what a data set states of itself. The covariance in
-    a message is not used, since it mostly is that of a filter's state, which is not white."""
+    a message is not used: mostly it is that of a filter's state, which is not white."""
     sigma_range: float | None = None
     """Standard deviation of the range at range 0 (m) of a detection without a covariance. Where none of these
     three is stated, they are measured, and without enough cones 0.05, 0.012 and 0.0157."""
@@ -121,19 +121,19 @@ class Frames(Checked, group=""):
 
 @dataclass(frozen=True)
 class Window(Checked, group=""):
-    """Which part of a record counts, and when its detections were measured."""
+    """Part of a record to convert, and correction of its stamps."""
 
     range_max: float | None = None
-    """Largest distance from the sensor of a detection that counts (m)."""
+    """Largest distance of a detection from the sensor (m); farther ones are dropped."""
     time_offset: Signed = 0.0
-    """Time (s) that is added to the stamps of the detections: negative where they are too late."""
+    """Time (s) added to the stamps of the detections: negative where they are too late."""
     start: AtLeast0 = 0.0
     """Time after the first odometry at which the log begins (s)."""
     end: Unlimited = inf
     """Time after the first odometry at which the log ends (s)."""
     spacing: float | None = None
     """Distance of points along a line, a kerb or a wall (m), to which dense ones are thinned and polylines
-    interpolated. It says that all detections are of lines. Without it those of a LaserScan and of polylines
+    interpolated. It means that all detections are of lines. Without it those of a LaserScan and of polylines
     are, at 0.15 of their median range."""
 
     def __post_init__(self) -> None:
@@ -177,9 +177,9 @@ class LabelRule:
         texts, place, counts = np.unique(values, return_inverse=True, return_counts=True)
         return np.array([*map(self.of, texts.tolist(), counts.tolist())], dtype=int)[place]
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """One line with the labels of the most frequent values; empty where there are none."""
-        most = self.met.most_common(MOST_TOLD)
+        most = self.met.most_common(MOST_SHOWN)
         values = [f"{text or 'empty'} is {NAMES[label]} ({count})" for (text, label), count in most]
         return f"labels: {', '.join(values)}{', ...' * (len(self.met) > len(most))}" if values else ""
 
@@ -187,8 +187,8 @@ class LabelRule:
         """Hint at values that may mean a side; empty where there are none."""
         unknown = [text for (text, label), _ in self.met.most_common() if label == UNKNOWN]
         unmapped = [text for text in unknown if label_words(text).isdisjoint(UNKNOWN_WORDS) and text]
-        told = f"labels {', '.join(unmapped[:MOST_TOLD])} are taken for unknown"
-        return f"{told}: --labels left={unmapped[0]} says what they mean" if unmapped else ""
+        told = f"labels {', '.join(unmapped[:MOST_SHOWN])} are read as unknown"
+        return f"{told}: --labels left={unmapped[0]} gives them a meaning" if unmapped else ""
 
 
 def _whole(text: str) -> str:

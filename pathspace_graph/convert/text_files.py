@@ -52,8 +52,8 @@ MAX_BEARING: Final = 2.0 * pi  # largest bearing (rad); more are degrees
 LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are large
 _BEFORE_ZONE: Final = re.compile(r"\s+(?=(?:Z|[+-]\d\d(?::?\d\d)?)$)")  # blanks before Z or an offset
 _OTHER: Final = {"range": "bearing", "bearing": "range"}
-MANY_ROWS: Final = 20  # number of rows whose nanoseconds tell that they are some
-LEAST_NANOSECONDS: Final = 1e6  # which the fractions of some seconds reach
+MANY_ROWS: Final = 20  # number of rows from which nanoseconds are checked
+LEAST_NANOSECONDS: Final = 1e6  # that fractions of so many rows reach
 MIN_PERIOD: Final = 1e-5  # least mean period of samples (s); less is a wrong unit of time
 MAX_PERIOD: Final = 1e3  # largest mean period of samples (s); more is a wrong unit of time
 

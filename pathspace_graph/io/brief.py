@@ -1,4 +1,4 @@
-"""What a notebook shows of records: texts here; pictures and frames of rooms above, imported on demand."""
+"""Texts of records in a notebook; pictures and frames come from rooms above, imported on demand."""
 
 from dataclasses import fields, is_dataclass
 from importlib import import_module

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"
-NO_COVARIANCE: Final[Array] = np.zeros((0, 0))  # none was asked for; it can't be written
-NO_CONES: Final[Array] = np.zeros((0, 2))  # none is known by its place
+NO_COVARIANCE: Final[Array] = np.zeros((0, 0))  # not requested; such a map can't be written
+NO_CONES: Final[Array] = np.zeros((0, 2))
 _SYMMETRY_TOLERANCE = 1e-9  # largest |P - P^T| over max|P| of a covariance that is symmetric to rounding
 _NEGATIVE_TOLERANCE = 1e-9  # most negative eigenvalue over the largest one of P >= 0, to rounding
 
@@ -43,7 +43,7 @@ class SplineBoundary(Brief):
     covariance: Array
     """Joint covariance (2m, 2m) in m^2 of the distinct control points, in the order x0, y0, x1 and so on."""
     confirmed_until: float = math.inf
-    """Parameter up to which the curve is confirmed; beyond, it is tentative, and may be taken back."""
+    """Parameter up to which the curve is confirmed; beyond, it is tentative and may be retracted."""
     cones: Array = field(default_factory=NO_CONES.copy)
     """Cones (k, 2) on the curve whose places are known: parameters, and standard deviations along it (m)."""
 

@@ -1,4 +1,4 @@
-"""What a run leaves (FORMATS): its map, trajectory in the TUM format, cycles and summary in one folder."""
+"""Result of a run (FORMATS): map, trajectory in the TUM format, cycles and summary in one folder."""
 
 from __future__ import annotations
 
@@ -100,11 +100,11 @@ class CycleRecord:
     jump: tuple[float, float, float] | None = None
     """Jump of the newest pose [m, m, rad], map frame, where the map was replaced in this cycle."""
     notice: str = ""
-    """What a user should know of the cycle, if anything."""
+    """Notice for the user about the cycle, if any."""
     offered: int = 0
     """Number of the cycle's detections."""
     health: str = ""
-    """Good, degraded or lost; empty where the estimator does not say it."""
+    """Good, degraded or lost; empty where the estimator does not report it."""
     reason: str = ""
     """Why the estimate is not good."""
     dropped: int = 0
@@ -117,7 +117,7 @@ class CycleRecord:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class VehicleState(Brief):
-    """What an estimator believes of the vehicle: its pose, and the calibration of its odometry."""
+    """Estimate of the vehicle: pose, and calibration of odometry and sensor."""
 
     LENGTHS: ClassVar = {"pose": POSE_LENGTHS, "sensor": (0, 1, 0, 0, 1)}
     COVARIANCES: ClassVar = {"covariance": (*POSE_LENGTHS, 0, 0), "sensor_covariance": (0, 1, 0, 0, 1)}
@@ -156,10 +156,10 @@ class VehicleState(Brief):
 
 @dataclass(frozen=True)
 class LapBatches:
-    """Ends of the batches that another process solves while an online estimator goes on."""
+    """Ends of the batches that another process solves beside an online estimator."""
 
     ends: tuple[int, ...]
-    """Cycles in which the result of a batch was taken, or the batch was given up."""
+    """Cycles in which the result of a batch was swapped in, or the batch was abandoned."""
     late: int
     """Cycles by which the slowest batch is late in a vehicle, by its wall time."""
 
@@ -173,7 +173,7 @@ class RunNoise:
     odometry: NoiseSource
     detections: NoiseSource
     measured: MeasuredNoise | None = None
-    """What was measured in the drive, where anything was."""
+    """Noise that was measured in the drive, if any."""
     size: Literal["odometry", "ranges"] | None = None
     """Ranges and speeds disagree, and the size of the map is that of these; None where they agree."""
 
@@ -217,7 +217,7 @@ class RunResult:
     waited: float = 0.0
     """Wall time for which the run waited for batches between cycles, s."""
     noise: RunNoise | None = None
-    """Noise that was used, where the estimator says it."""
+    """Noise that was used, where the estimator reports it."""
     scale: float = 1.0
     """Size of the scene by that of a Formula Student track."""
     smoothed: Array | None = None

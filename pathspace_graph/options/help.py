@@ -1,4 +1,4 @@
-"""The help of a command and what a shell completes, both made of its options and of their docstrings."""
+"""Help of a command and completion by a shell, both from its options and their docstrings."""
 
 import ast
 import sys

@@ -1,4 +1,4 @@
-"""`demo`, `online`, `batch`, `plot` and `export`: maps of logs, and what is made of them."""
+"""`demo`, `online`, `batch`, `plot` and `export`: maps of logs, and exports of them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -62,17 +62,17 @@ class Online(Estimation):
     start: tuple[float, float, float] | None = None
     """Pose X Y HEADING (m, m, rad) on the known map near which the drive begins; by default anywhere."""
     keep_map: bool = False
-    """Hold the known map as it is, and only localize."""
+    """Keep the known map fixed, and only localize."""
     map_sigma: float = 0.15
     """Standard deviation of the cones of a track file, m."""
     save: Path | None = None
     """File to which the mapper is saved at the end, for `--resume`; only `fixed-lag` can be saved."""
     resume: Path | None = None
-    """File of a saved mapper, which goes on with its settings, and with cycles after its newest."""
+    """File of a saved mapper, which continues with its own settings and with cycles after its newest."""
     plot: Path | None = None
     """File for a picture of the map (.png, .pdf or .svg); an earlier one is kept as a numbered backup."""
     view: bool = False
-    """Show the run in the window of the live viewer rerun while it goes on."""
+    """Show the run in the live viewer rerun."""
     save_view: Path | None = None
     """File (.rrd) for what the viewer shows; an earlier one is kept as a numbered backup."""
     animate: Path | None = None
@@ -98,7 +98,7 @@ class Batch(Estimation):
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
     start: Start | None = None
-    """Where the optimization begins; by default as `batch.start` says."""
+    """Where the optimization begins; by default that of `batch.start`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +112,7 @@ class Plot:
     log: Path | None = None
     """Folder of the log whose truth is drawn as well."""
     band_scale: float = 1.0
-    """Factor by which the band is drawn wider than it is, which the legend says."""
+    """Factor by which the band is widened in the picture; the legend states it."""
     title: str | None = None
     """Title of the picture."""
 
@@ -133,8 +133,8 @@ class Export:
     step: float = 1.0
     """Distance of the points along a curve (m)."""
     origin: tuple[float, float, float] | None = None
-    """Latitude and longitude of the map's origin (degrees, WGS84), and heading of its x axis, which is the
-    way that the vehicle faced at the start (degrees, clockwise from north). `geojson` and `lanelet2` need
+    """Latitude and longitude of the map's origin (degrees, WGS84), and heading of its x axis, the direction
+    of the vehicle at the start (degrees, clockwise from north). `geojson` and `lanelet2` need
     them."""
     speed: SpeedSettings = field(default_factory=SpeedSettings)
     """Vehicle of a `profile`."""

@@ -1,4 +1,4 @@
-"""Settings of what judges estimators: what a ghost is, and how far the time of an update is measured."""
+"""Settings of the evaluation: definition of a ghost, and extent of the timing."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ class GhostSettings(Checked):
 
 @dataclass(frozen=True)
 class ScalingSettings(Checked):
-    """What is measured of how time scales."""
+    """Extent of the timing."""
 
     cones_min: float = 50.0
     """Least number of cones seen of a point of the sweep over cones."""

@@ -125,10 +125,10 @@ class FarSettings(Checked):
 
 @dataclass(frozen=True)
 class RelinearizeSettings(Checked):
-    """Which factors of the window are linearized anew in a step: those whose variables moved.
+    """Which factors of the window are relinearized in a step: those whose variables moved.
 
-    This applies after the loop has closed. Until then all factors are linearized anew, since an error of
-    linearization turns the map with a long lever there.
+    This applies after the loop has closed. Until then all factors are relinearized, since an error of
+    linearization rotates the map with a long lever.
     """
 
     point: float = 0.2
@@ -159,7 +159,7 @@ class OpenLapSettings(Checked, group="open_lap"):
     cycles_share: float = 0.03
     """Share of a long lap's cycles that replaces `cycles` where it is more; the window grows until then."""
     late: int = 100
-    """Most cycles by which a batch may be late, after which it is given up, as with more than `max_poses`."""
+    """Most cycles by which a batch may be late, after which it is abandoned, as beyond `max_poses`."""
     ends: tuple[int, ...] = ()
     """Cycles in which the batches replace the prior in a replay: `batches.ends` of `summary.json`."""
     retry: float = 20.0
@@ -195,7 +195,7 @@ class CkfSettings(Checked):
     """The paper's filters."""
 
     ridge: float = 0.05
-    """Lambda of the ridge regression, which holds control points at their places (paper: Update)."""
+    """Lambda of the ridge regression, which ties control points to their places (paper: Update)."""
     sigma_model: float = 0.25
     """Standard deviation of a cone's distance from a smooth curve (m), added in each detection."""
     sigma_along: float = 1.0
@@ -209,7 +209,7 @@ class CkfSettings(Checked):
     share of their spacing. A large value gives the filter as it is published, whose uncertainty multiplies
     with each extension."""
     sightings: int = 3
-    """Detections that make a landmark of the baseline filter; 1, as it is described, takes every one."""
+    """Detections that make a landmark of the baseline filter; its description has 1: every one."""
 
 
 @dataclass(frozen=True)
@@ -225,14 +225,14 @@ class MapperSettings(Checked, group=""):
     steps_grown: int = 1
     """Gauss-Newton steps of a cycle in which a curve grew."""
     stations: bool = True
-    """Whether the cones of a closed map hold the vehicle along its curves; without, only across them."""
+    """Whether the cones of a closed map constrain the vehicle along its curves, not only across them."""
     noise: Literal["measured", "stated"] | None = None
     """Noise of odometry and detections: by default as stated, and measured where nothing is. Constant errors
     of the sensor are measured unless this is `stated`."""
     kind: Kind | None = None
     """What detections are of: cones, which stay where they are, or a line, whose points lie anywhere along
     it, on both sides or on one. By default the log states it, or its first seconds tell it; an online
-    estimator that is made without one takes cones, and a notice tells if they are of a line."""
+    estimator that is made without one takes cones, and a notice appears if they are of a line."""
     scale: float | None = None
     """Size of the scene by that of a Formula Student track: 0.1 for a model car of 1:10, 3 for a road. All
     lengths of the settings are those at scale 1. By default the first metres of the log tell it; an online

@@ -40,7 +40,7 @@ class ClosingSettings(Checked):
     sigma_max: float = 0.4
     """Largest standard deviation of the registered position along its worst direction (m)."""
     gauge_laps: Unlimited = 4.0
-    """Laps on the closed map after which its position and heading as a whole are held; `inf` for never."""
+    """Laps on the closed map after which its position and heading as a whole are fixed; `inf` for never."""
 
     check_interval: ClassVar[float] = 2.0  # m along the path, from one attempt to close the loop to the next
     radius: ClassVar[float] = 8.0  # m from the first stretch of the drive, within which the loop may close
@@ -85,7 +85,7 @@ class MotionSettings(Checked):
     """The check of the odometry against the detections; where they contradict it, their motion is used."""
 
     doubt: Unlimited = 5.0
-    """Contradiction from which the odometry is not believed, standard deviations; `inf` to believe it."""
+    """Contradiction from which the odometry is distrusted, standard deviations; `inf` to trust it always."""
 
     accelerations: ClassVar = (5.0, 5.0, 1.5)
     """Growth of the twist's uncertainty where one is held for longer than usual (m/s^2, m/s^2, rad/s^2)."""
@@ -93,16 +93,16 @@ class MotionSettings(Checked):
 
 @dataclass(frozen=True)
 class SidesSettings(Checked):
-    """How the side of a cone is told from the way driven."""
+    """How the side of a cone is found from the driven path."""
 
     colourless: float = 0.7
-    """Share of detections without a colour from which sides are told from the rows of cones; 1 for never."""
+    """Share of detections without a colour from which rows of cones give the sides; 1 for never."""
 
 
 # --- priors of constant errors, which become wide where a drive contradicts them -------------------------
 
 WIDE_ODOMETRY: Final = 10.0  # standard deviations of the odometry's wide priors by those of a calibrated one
-HELD: Final = 0.02  # standard deviation of a scale that is held, by its own
+HELD: Final = 0.02  # standard deviation of a fixed scale, by its own
 WIDE_SENSOR: Final = 20.0  # standard deviations of the sensor's wide priors by those of a calibrated one
 
 
@@ -145,14 +145,14 @@ class OdometrySettings(_Priors):
     sigma_bias: float = 0.002
     """Standard deviation of the bias, rad/s."""
     doubt: Unlimited = 4.0
-    """Contradiction from which both priors become wide, standard deviations; `inf` to hold them always."""
+    """Contradiction from which both priors become wide, standard deviations; `inf` for never."""
     hold_scale: bool = False
-    """Whether the scale is held, since the speeds set the size of the map: a free one would shrink it until
-    its residuals are smaller. Its standard deviation is that of the size, in every covariance."""
+    """Whether the scale is fixed, since the speeds set the size of the map: a free one would shrink it to
+    reduce its residuals. Its standard deviation is that of the size, in every covariance."""
 
     @property
     def sigmas(self) -> tuple[float, ...]:
-        """Standard deviations of the priors; a scale that is held is as good as known."""
+        """Standard deviations of the priors; a fixed scale is nearly known."""
         return self.sigma_scale * (HELD if self.hold_scale else 1.0), self.sigma_bias
 
     @property
@@ -198,7 +198,7 @@ class CalibrationSettings(_Priors):
     """Which of the two sets the size of the map where ranges and speeds disagree: only their ratio can be
     seen. By default the odometry, unless ranges scatter by less than its scale is known."""
     doubt: Unlimited = 4.0
-    """Contradiction from which the priors become wide, standard deviations; `inf` to hold them always."""
+    """Contradiction from which the priors become wide, standard deviations; `inf` for never."""
 
     def widened(self) -> Self:
         """Widen the priors, which are not doubted again.

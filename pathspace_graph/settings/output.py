@@ -1,4 +1,4 @@
-"""Settings of what is made of a map or a run: a speed profile, a recording for the live viewer, a film."""
+"""Settings of a speed profile, a recording for the live viewer, and a film."""
 
 from dataclasses import dataclass
 
@@ -43,6 +43,6 @@ class FilmSettings(Checked):
     height: int = 520
     """Height of a frame, pixels."""
     laps: Unlimited = float("inf")
-    """Laps after which the film ends; the mapping goes on without it."""
+    """Laps after which the film ends; the mapping continues."""
     hold: float = 2.0
     """Time for which the last frame is shown, s."""

@@ -658,7 +658,7 @@ def test_a_wrong_topic_lists_all_with_types_counts_and_rates(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--odometry", "/odom", "--detections", "/odom"], "supported is what has a point cloud"),
+        (["--odometry", "/odom", "--detections", "/odom"], "supported are messages with a point cloud"),
         ([*TOPICS, "--label-field", "klass"], "in the field 'klass', found x, y, label"),
         ([*TOPICS, "--labels", "blue=0"], "--labels: expected LABEL=VALUE"),
         ([*TOPICS, "--mounting", "0", "0", "90"], "mounting: expected a yaw of at most 2 pi rad, found 90"),

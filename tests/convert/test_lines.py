@@ -1,4 +1,4 @@
-"""Scans, dense clouds and polylines become points along the boundaries of the way driven."""
+"""Scans, dense clouds and polylines become points along the boundaries of the driven path."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def test_sides_are_those_of_the_way_and_what_is_far_is_left_out() -> None:
         assert len(one.labels) == 16
         np.testing.assert_array_equal(one.labels == LEFT, one.points[:, 1] > 0.0)
         np.testing.assert_array_equal(one.labels == RIGHT, one.points[:, 1] < 0.0)
-    assert notes["points of lines were too far from the way driven, and were left out"] == 3
+    assert notes["points of lines were too far from the driven path, and were left out"] == 3
     mirrored = lines_of(np.array([1.0]), scans[:1], AHEAD, Frames(y="right"), 0.5, notes)[0]
     np.testing.assert_array_equal(mirrored.labels == RIGHT, mirrored.points[:, 1] > 0.0)
 
