@@ -51,7 +51,6 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {  # units of each quantity, i
 MAX_BEARING: Final = 2.0 * pi  # largest bearing (rad); more are degrees
 LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are large
 _BEFORE_ZONE: Final = re.compile(r"\s+(?=(?:Z|[+-]\d\d(?::?\d\d)?)$)")  # blanks before Z or an offset
-_OTHER: Final = {"range": "bearing", "bearing": "range"}
 MANY_ROWS: Final = 20  # number of rows from which nanoseconds are checked
 LEAST_NANOSECONDS: Final = 1e6  # that fractions of so many rows reach
 MIN_PERIOD: Final = 1e-5  # least mean period of samples (s); less is a wrong unit of time
@@ -225,7 +224,9 @@ def _points(file: _File) -> Array:
     if file.has("x") and (DETECTIONS, "range") not in file.named:
         return np.column_stack([file.numbers("x"), file.numbers("y")])
     if not (file.has("range") and file.has("bearing")):
-        raise _without_place(file)
+        expected = "expected the columns x and y, or range and bearing (--columns x=NAME)"
+        found = f"found the columns {', '.join(file.table.columns)}"
+        raise InputError(file.table.file, f"{expected}, {found}", 1)
     ranges, bearings = file.numbers("range"), file.numbers("bearing")
     name, unit = file.column("bearing"), file.units["angle"]
     file.table.require(
@@ -235,15 +236,6 @@ def _points(file: _File) -> Array:
     )
     file.table.require(~(ranges < 0.0), f"expected ranges of at least 0 in column '{file.column('range')}'")
     return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
-
-
-def _without_place(file: _File) -> InputError:
-    """Error of detections that have neither x and y nor range and bearing."""
-    polar = next((key for key in ("range", "bearing") if not file.has(key) and file.has(_OTHER[key])), "")
-    either = f"'{polar}' beside {_OTHER[polar]}, or x and y" if polar else "'x' and y, or range and bearing"
-    expected = f"expected a column {either} (--columns {polar or 'x'}=NAME)"
-    found = f"found the columns {', '.join(file.table.columns)}"
-    return InputError(file.table.file, f"{expected}, {found}", 1)
 
 
 def read_json_lines(file: Path, rule: LabelRule) -> Recording:
