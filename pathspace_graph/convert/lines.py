@@ -51,9 +51,9 @@ def lines_of(
     found = [along_lines(scan, spacing) for scan in scans]
     told = f"points of lines are {spacing:.2g} m apart (--spacing), of {count(scans)} that were recorded"
     notes[told] += count(found)
-    way = DrivenWay.of(odometry, 0.5 * spacing)
+    path = DrivenPath.of(odometry, 0.5 * spacing)
     places = [in_vehicle(scan.points, frames) for scan in found]
-    lateral = [way.lateral(float(at), points) for at, points in zip(t, places, strict=True)]
+    lateral = [path.lateral(float(at), points) for at, points in zip(t, places, strict=True)]
     kept = [nearest_lines(scan.lines, away) for scan, away in zip(found, lateral, strict=True)]
     limit = farthest(np.concatenate(lateral))
     result = []
@@ -129,7 +129,7 @@ def thinned(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class DrivenWay:
+class DrivenPath:
     """The path driven, by dead reckoning from the pose at the first twist."""
 
     t: Array  # (N,) stamps (s)
@@ -139,7 +139,7 @@ class DrivenWay:
     at: Array  # (k,) their path lengths (m)
 
     @classmethod
-    def of(cls, odometry: Odometry, step: float) -> "DrivenWay":
+    def of(cls, odometry: Odometry, step: float) -> "DrivenPath":
         moves = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
         poses = np.vstack([np.zeros(3), moves])
         s = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
@@ -158,14 +158,14 @@ class DrivenWay:
         placed = points @ rotation(float(heading)).T + np.array([x, y])
         reach = WALL_STRETCH * np.hypot(*points.T)
         near = np.abs(self.at - here) <= reach.max(initial=0.0)
-        way, at = self.points[near], self.at[near]
-        if len(way) < 2:
+        path, at = self.points[near], self.at[near]
+        if len(path) < 2:
             return np.full(len(points), np.nan)
-        offset = placed[:, None] - way
+        offset = placed[:, None] - path
         distances = np.hypot(offset[..., 0], offset[..., 1])
         distances[np.abs(at - here) > reach[:, None]] = np.inf
         foot = distances.argmin(axis=1)
-        along, away = np.gradient(way, axis=0)[foot], offset[np.arange(len(foot)), foot]
+        along, away = np.gradient(path, axis=0)[foot], offset[np.arange(len(foot)), foot]
         side = np.sign(along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0])
         forward = (along * away).sum(axis=1)
         first, last = at[foot] == self.at[0], at[foot] == self.at[-1]

@@ -81,34 +81,6 @@ def test_no_finite_number(name: str, column: str, value: str, log: Path) -> None
     assert f"'{column}'" in line
 
 
-def test_a_file_in_place_of_a_log(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["online", str(log / "log.toml"), "--out", str(log.parent / "map")]) == 2
-    line = capsys.readouterr().err
-    assert line.count("\n") == 1
-    assert "expected a log folder" in line
-
-
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("track.txt", "1 2\n"),
-        ("track.yaml", "cones: []\n"),
-        ("track.yaml", "7\n"),
-        ("track.csv", "a,b\n1,2\n"),
-    ],
-)
-def test_a_track_of_an_unknown_kind_names_the_known_ones(
-    name: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / name).write_text(text)
-    assert main(["simulate", "--track", str(tmp_path / name), "--out", str(tmp_path / "log")]) == 2
-    line = capsys.readouterr().err
-    assert line.count("\n") == 1
-    assert str(tmp_path / name) in line
-    assert all(kind in line for kind in ("PacSim", "fssim", "EUFS", "TUM"))
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
 @pytest.mark.parametrize(("command", "out"), [("online", "map"), ("batch", "map"), ("compare", "table")])
 @pytest.mark.parametrize(("column", "value"), [("vx", "900"), ("vy", "-101"), ("wz", "10.5")])
 def test_a_motion_that_no_vehicle_can_make(

@@ -194,14 +194,6 @@ def test_a_huber_loss_without_a_limit_is_least_squares(
     assert read_map(tmp_path / "map").boundaries
 
 
-def test_a_second_run_keeps_the_earlier_result(tmp_path: Path) -> None:
-    assert simulate(tmp_path / "log") == 0
-    first = contents(tmp_path / "log")
-    assert simulate(tmp_path / "log", "--seed", "1") == 0
-    assert names(tmp_path) == {"log", "log.~1~"}
-    assert contents(tmp_path / "log.~1~") == first
-
-
 @pytest.mark.parametrize("command", ["online", "batch"])
 def test_a_boundary_across_the_drive_is_told_with_its_place_and_exit_code_3(
     command: str,

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from pathspace_graph.cli import main
-from pathspace_graph.convert.lines import DrivenWay, along_lines, are_lines, lines_of, resampled, thinned
+from pathspace_graph.convert.lines import DrivenPath, along_lines, are_lines, lines_of, resampled, thinned
 from pathspace_graph.convert.messages import ALONE, DENSE, Points, points_of
 from pathspace_graph.convert.recording import MessageStream
 from pathspace_graph.convert.settings import Frames, LabelRule
@@ -142,10 +142,10 @@ def test_a_record_is_of_lines_where_nothing_stands_alone_or_where_a_spacing_is_s
 
 
 def test_the_distance_to_the_left_of_the_way_is_that_of_the_stretch_around_the_vehicle() -> None:
-    way = DrivenWay.of(AHEAD, 0.01)
+    path = DrivenPath.of(AHEAD, 0.01)
     points = np.array([[2.0, 1.5], [2.0, -1.0], [-3.0, 1.0], [-6.0, 1.0], [6.0, 1.0]])
     # at 5 s the vehicle is at x = 5: the last two points are beyond the ends of the way
-    np.testing.assert_allclose(way.lateral(5.0, points), [1.5, -1.0, 1.0, np.nan, np.nan], atol=1e-3)
+    np.testing.assert_allclose(path.lateral(5.0, points), [1.5, -1.0, 1.0, np.nan, np.nan], atol=1e-3)
 
 
 def test_a_stretch_that_comes_near_later_does_not_decide_a_side() -> None:
@@ -154,12 +154,12 @@ def test_a_stretch_that_comes_near_later_does_not_decide_a_side() -> None:
     straight, bend = np.zeros(1000), np.full(round(np.pi * 300), 1.0 / 3.0)
     turn = np.concatenate([straight, bend, straight])
     twists = np.column_stack([np.ones(len(turn)), np.zeros(len(turn)), turn])
-    way = DrivenWay.of(Odometry(np.arange(len(turn)) / rate, twists), 0.02)
+    path = DrivenPath.of(Odometry(np.arange(len(turn)) / rate, twists), 0.02)
     # 3.8 m to the left, nearer to the way back, is left of the way there, and of the way back as well
-    there = way.lateral(2.0, np.array([[0.0, 3.8]]))
+    there = path.lateral(2.0, np.array([[0.0, 3.8]]))
     np.testing.assert_allclose(there, [3.8], atol=0.02)
     # ahead in the bend, the outer wall is to the right of the way that is driven later
-    ahead = way.lateral(8.0, np.array([[6.5, 2.0]]))
+    ahead = path.lateral(8.0, np.array([[6.5, 2.0]]))
     assert ahead[0] == pytest.approx(-(np.hypot(4.5, -1.0) - 3.0), abs=0.02)
 
 

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pathspace_graph.errors import InputError, OutputError
+from pathspace_graph.errors import InputError
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth, read_log, write_log
 from pathspace_graph.io.parsing import MAX_HELD, MAX_RANGE
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
@@ -90,21 +90,6 @@ def test_round_trip_is_exact_for_any_numbers(
     log = Log(Odometry(t, twist), (cycle,), np.ones(3))
     write_log(log, folder)
     assert_same(read_log(folder), log)
-
-
-def test_second_write_keeps_the_first(tmp_path: Path) -> None:
-    log = small_log()
-    write_log(log, tmp_path / "log")
-    write_log(log, tmp_path / "log")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["log", "log.~1~"]
-    assert_same(read_log(tmp_path / "log.~1~"), log)
-
-
-def test_write_refuses_a_foreign_folder(tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").write_text("precious")
-    with pytest.raises(OutputError, match=r"log\.toml"):
-        write_log(small_log(), tmp_path)
-    assert (tmp_path / "mine.txt").read_text() == "precious"
 
 
 @pytest.fixture

@@ -299,11 +299,8 @@ def test_a_log_names_its_faults_and_one_without_faults_has_no_such_line(clean: L
     ("make", "says"),
     [
         (lambda: SensorFaults(latency=float("inf")), "faults.sensor.latency: expected a number"),
-        (lambda: SensorFaults(colourless=1.5), "faults.sensor.colourless"),
         (lambda: SensorFaults(range_scale=-1.0), "faults.sensor.range_scale: expected more than -1"),
-        (lambda: SensorFaults(yaw=float("nan")), "faults.sensor.yaw: expected a number"),
         (lambda: OdometryFaults(slip_every=0.0), "faults.odometry.slip_every: expected a positive"),
-        (lambda: OdometryFaults(slip=float("inf")), "faults.odometry.slip: expected a number"),
         (lambda: VehicleFaults(put_down=-5.0), "faults.vehicle.put_down"),
     ],
 )
