@@ -55,11 +55,12 @@ def corrected(measured: Array, twists: Array, sensor: Array) -> Array:
 
 
 def by_range(points_vehicle: Array) -> Array:
-    """Derivatives (m, 2, 2, 2) of `M^-1` by the range scale and by the range bias.
+    """Derivatives (m, 2, 2, 2) of `-M` by the range scale and by the range bias.
 
     M is the derivative of a corrected detection by the measured one, z (m, 2). Covariances are stated for
     measured detections, so a residual r of a corrected one counts as `M^-1 r`. Without this, least squares
-    would shrink the world. The derivatives are
+    would shrink the world. `M^-1` is exact: to first order, a scale error s would still shrink it by the
+    order of `s^2`, which is 0.6 % for the 8 % of a poor camera. The derivatives are
 
         I (range scale),   (I - z z' / |z|^2) / |z| (range bias)
     """
@@ -81,7 +82,7 @@ def restored(residual: Array, measured: Array, twists: Array, sensor: Array) -> 
     if len(sensor) == 0:
         return np.tile(np.eye(2), (len(measured), 1, 1)), np.zeros((len(measured), 2, 0))
     rates = by_range(measured)
-    inverse = np.eye(2) + np.einsum("mkij,k->mij", rates, sensor[RANGE])
+    inverse = np.linalg.inv(np.eye(2) - np.einsum("mkij,k->mij", rates, sensor[RANGE]))
     jacobian = -inverse @ by_sensor(measured, twists)
-    jacobian[:, :, RANGE] += np.einsum("mkij,mj->mik", rates, residual)
+    jacobian[:, :, RANGE] += np.einsum("mil,mklj,mjn,mn->mik", inverse, rates, inverse, residual)
     return inverse, jacobian

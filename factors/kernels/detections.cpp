@@ -79,11 +79,11 @@ py::tuple detection_rows(const Array& points, const Array& covariances, const Ar
       const double along = (own[0] * z[0] + own[1] * z[1]) / distance;
       const double square = own[0] * own[0] + own[1] * own[1];
       const double rates[2] = {square, (square - along * along) / distance};
-      factor += rates[0] * sensor.data()[3] + rates[1] * sensor.data()[4];
+      factor = 1.0 / (1.0 - rates[0] * sensor.data()[3] - rates[1] * sensor.data()[4]);
       sensor_columns(z, twists.data() + 3 * i, C);
       for (Index k = 0; k < kSensor; ++k) J[3 + k] = factor * (own[0] * C[0][k] + own[1] * C[1][k]);
-      J[6] += r * rates[0];
-      J[7] += r * rates[1];
+      J[6] += r * factor * factor * rates[0];
+      J[7] += r * factor * factor * rates[1];
     }
     residual.mutable_data()[i] = factor * r;
     J[0] = factor * n[0];

@@ -127,10 +127,10 @@ def test_a_smaller_world_fits_no_better() -> None:
         sensor[k] = error
         corrected = seen + by_sensor(seen, still) @ sensor
         world = cones + by_sensor(cones, still) @ sensor
-        restored = np.eye(2) + np.einsum("mkij,k->mij", by_range(seen), sensor[3:])
-        residual = np.einsum("mij,mj->mi", restored, corrected - world)
+        inverse, _ = restored(corrected - world, seen, still, sensor)
+        residual = np.einsum("mij,mj->mi", inverse, corrected - world)
         before, after = (noise**2).sum(), (residual**2).sum()
-        assert abs(after / before - 1.0) < 4.0 * error**2 + 5e-3
+        assert abs(after / before - 1.0) < (1e-9 if k == 3 else 0.01)
         assert ((corrected - world) ** 2).sum() / before < 1.0 - 0.5 * error * (2.0 if k == 3 else 0.05)
 
 

@@ -27,14 +27,14 @@ def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
 def sensor_terms(
     directions: Array, residual: Array, poses: Array, measured: Array, twists: Array, sensor: Array
 ) -> tuple[Array, Array]:
-    """Return factors `f = 1 + rates b` (m,) and derivatives `f d' R C + r rates` (m, 5) by b."""
+    """Return factors `f = 1 / (1 - rates b)` (m,) and derivatives `f d' R C + f^2 r rates` (m, 5) by b."""
     if len(sensor) == 0:
         return np.ones(len(residual)), np.zeros((len(residual), 0))
     along = in_vehicle(directions, poses)
     rates = np.einsum("mi,mkij,mj->mk", along, by_range(measured), along)
-    factor = 1.0 + rates @ sensor[RANGE]
+    factor = 1.0 / (1.0 - rates @ sensor[RANGE])
     jacobian = np.einsum("mi,mik->mk", along, by_sensor(measured, twists)) * factor[:, None]
-    jacobian[:, RANGE] += residual[:, None] * rates
+    jacobian[:, RANGE] += (residual * factor**2)[:, None] * rates
     return factor, jacobian
 
 
