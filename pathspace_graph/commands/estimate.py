@@ -129,8 +129,6 @@ def known_track(options: Online) -> KnownTrack | None:
         raise SettingsError(f"--on: expected --estimator {DEFAULT_ONLINE}, found {options.estimator}")
     if options.resume is not None:
         raise SettingsError("--on: expected no --resume, since a saved mapper has its own map")
-    if not 0.0 < options.map_sigma < np.inf:
-        raise SettingsError(f"--map-sigma: expected a positive number, found {options.map_sigma:g}")
     return read_known_map(options.on, options.map_sigma, options.settings)
 
 

@@ -6,6 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
+from pathspace_graph.settings.checked import Checked
 from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
 from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings, SpeedSettings
@@ -46,7 +47,7 @@ class Demo(Estimation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Online(Estimation):
+class Online(Checked, Estimation, group=""):
     """Map a log online, cycle by cycle, and write the map, the trajectory, the cycles and a summary."""
 
     log: Path = field(metadata=PLACE)
@@ -102,7 +103,7 @@ class Batch(Estimation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plot:
+class Plot(Checked, group=""):
     """Draw a map: both boundaries with their 2-sigma band, control points, trajectory and any truth."""
 
     map: Path = field(metadata=PLACE)

@@ -47,7 +47,7 @@ online LOG --out MAP --keep-map | --keep-map: expected --on MAP as well, found n
 online LOG --out MAP --on map --estimator ckf | --on: expected --estimator fixed-lag, found ckf
 online LOG --out MAP --on map --resume S | --on: expected no --resume, since a saved mapper has its own map
 online LOG --out MAP --on map --start 1 2 | --start: expected 3 numbers
-online LOG --out MAP --on map --map-sigma 0 | --map-sigma: expected a positive number, found 0
+online LOG --out MAP --on map --map-sigma 0 | map_sigma: expected a positive number, found 0
 online LOG --out MAP --on nowhere | nowhere: expected a map's folder, a track file, skidpad or acceleration
 batch --out MAP | batch: expected LOG, found none
 batch a b --out MAP --estimator landmark-batch | --estimator: expected spline for several logs
@@ -65,7 +65,7 @@ export map --out F --as points --step nan | --step: expected a number of at leas
 export map --out F --as tum | trajectory.tum: expected a trajectory, found none
 plot map --out map.doc | map.doc: expected a file name that ends
 plot MAP --out map.png | map.json: expected a map, found none
-plot map --out map.png --band-scale 0 | --band-scale: expected a positive number
+plot map --out map.png --band-scale 0 | band_scale: expected a positive number
 convert --from csv --out LOG | convert: expected SOURCE, found none
 convert BAG --out LOG --sigma-odometry 1 2 | --sigma-odometry: expected 3 numbers, found '1 2' (see
 convert BAG --out LOG --mounting 1 -2 a | --mounting: expected 3 numbers, found '1 -2 a' (see

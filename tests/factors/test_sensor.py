@@ -14,7 +14,6 @@ from pathspace_graph.factors.se2 import compose, in_vehicle, inverse, rotation, 
 from pathspace_graph.factors.sensor import (
     SENSOR,
     by_bend,
-    by_range,
     by_sensor,
     restored,
 )
