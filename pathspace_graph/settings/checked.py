@@ -47,25 +47,22 @@ class Checked:
         """Raise a SettingsError that names the first wrong setting, as the command line knows it."""
         types = _types(type(self))  # type: ignore[arg-type]  # a class has a hash, whatever its heirs'
         for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
-            value, (kind, rule) = getattr(self, entry.name), types[entry.name]
+            value, (kind, stated) = getattr(self, entry.name), types[entry.name]
             if not is_of(value, kind):
                 expected = f"expected {in_words(kind)}, found {value!r}"
                 raise SettingsError(f"{self.prefix}{entry.name}: {expected:.200}")
-            for number in value if isinstance(value, tuple) else (value,):
+            numbers = value if isinstance(value, tuple) else (value,)
+            rule = stated or ("" if isinstance(value, tuple) else POSITIVE)
+            for number in numbers:
                 if rule and is_of(number, float) and not RULES[rule](number):
                     raise SettingsError(f"{self.prefix}{entry.name}: expected {rule}, found {number}")
 
 
 @cache
 def _types(settings: Any) -> dict[str, tuple[Any, str]]:
-    """Type of each setting, and the rule of its numbers; a tuple without an annotation has none."""
-    types = {}
-    for name, kind in get_type_hints(settings, include_extras=True).items():
-        if get_origin(kind) is Annotated:
-            types[name] = get_args(kind)
-        else:
-            types[name] = (kind, "" if get_origin(kind) is tuple else POSITIVE)
-    return types
+    """Type of each setting, and the rule of its annotation; empty without one."""
+    kinds = get_type_hints(settings, include_extras=True).items()
+    return {name: get_args(kind) if get_origin(kind) is Annotated else (kind, "") for name, kind in kinds}
 
 
 def is_of(value: Any, kind: Any) -> bool:
