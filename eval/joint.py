@@ -11,17 +11,18 @@ from pathspace_graph.batch.joint_mapper import join
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.estimators import DEFAULT_BATCH, make_batch
 from pathspace_graph.factors.se2 import inverse
-from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.log import Log
 from pathspace_graph.io.moved import moved_run
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from .cars import CARS, generated, on_tracks
 from .experiment.rows import rows_of
+from .experiment.tables import Quantity, Table
 from .metrics.alignment import shape_rmse
 from .metrics.consistency import consistency_at_cones, map_nees
+from .metrics.reference import truth_of
 from .metrics.trajectory import position_rms, trajectory_errors
-from .views import Figure, View
 
 COLUMNS: Final = {  # of the table: title, digits, factor
     "shape": ("rmse of the shape [m]", 3, 1.0),
@@ -73,7 +74,7 @@ def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) 
         joint = join(mapped)
         first, mapped = next(iter(joint.drives)), joint.drives
         own = {name: moved_run(drive, inverse(joint.frames[name])) for name, drive in mapped.items()}
-    track, truths = mapped[first].map, {name: _truth(logs[name]) for name in mapped}
+    track, truths = mapped[first].map, {name: truth_of(logs[name]) for name in mapped}
     errors = [trajectory_errors(own[name].trajectory_t, own[name].trajectory, truths[name]) for name in own]
     return {
         "shape": shape_rmse(track, truths[first]),
@@ -84,12 +85,7 @@ def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) 
     }
 
 
-def _truth(log: Log) -> Truth:
-    assert log.truth is not None
-    return log.truth
-
-
-def joint_table(frame: pd.DataFrame) -> View:
+def joint_table(frame: pd.DataFrame) -> Table:
     """Return a row for each kind of car and number of drives, over tracks: the maps of one are no sample."""
     rows = []
     for car, of_car in frame.groupby("car", sort=False):
@@ -98,6 +94,6 @@ def joint_table(frame: pd.DataFrame) -> View:
             own = means.loc[count]
             before = means.loc[count // 2]["shape"] if count > 1 else np.nan
             values = own.assign(ratio=own["shape"] / before)
-            figures = (Figure.of(values[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
-            rows.append((f"{car}, {count} drive{'s' if count > 1 else ''}", tuple(figures)))
-    return ("cars, drives of a track", *(title for title, _, _ in COLUMNS.values())), tuple(rows)
+            figures = (Quantity.of(values[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
+            rows.append((f"{car}, {count} drive{'s' if count > 1 else ''}", *figures))
+    return Table(("cars, drives of a track", *(title for title, _, _ in COLUMNS.values())), tuple(rows))

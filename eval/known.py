@@ -21,9 +21,11 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from .cars import CARS, generated, on_tracks
 from .experiment.rows import rows_of
+from .experiment.tables import Quantity, Table
 from .metrics.accuracy import lap_metrics
+from .metrics.reference import truth_of
+from .metrics.registration import motion_onto
 from .metrics.trajectory import interpolate_poses
-from .views import Figure, View
 
 OWN, SURVEYED, MOVED, OTHER = "another drive's", "surveyed", "surveyed, 7 cones moved", "another track's"
 KINDS: Final = (OWN, SURVEYED, MOVED, OTHER)  # of known maps
@@ -77,11 +79,6 @@ def of_track(
     return rows
 
 
-def truth_of(log: Log) -> Truth:
-    assert log.truth is not None
-    return log.truth
-
-
 def mapped(log: Log) -> Map:
     """Return the online map of a drive."""
     return run_online(log, make_online(DEFAULT_ONLINE, MapperSettings(), log), name=DEFAULT_ONLINE).map
@@ -129,22 +126,13 @@ def drive_on(known: Map, log: Log, share: float, motion: Array) -> dict[str, Any
     }
 
 
-def motion_onto(points: Array, onto: Array) -> Array:
-    """Return the motion (3,) that leads points (n, 2) onto others, by least squares (Umeyama 1991)."""
-    middle, goal = points.mean(axis=0), onto.mean(axis=0)
-    a, b = (points - middle) @ [1.0, 1j], (onto - goal) @ [1.0, 1j]
-    turn = float(np.angle(np.vdot(a, b)))
-    turned = complex(*middle) * np.exp(1j * turn)
-    return np.array([goal[0] - turned.real, goal[1] - turned.imag, turn])
-
-
-def known_table(frame: pd.DataFrame) -> View:
+def known_table(frame: pd.DataFrame) -> Table:
     """Return a row for each car and kind of map, over tracks: the drives of one are no sample."""
     rows = []
     for car, of_car in frame.groupby("car", sort=False):
         for kind in KINDS:
             drives = of_car[of_car["kind"] == kind]
             means = drives.groupby("track")[[*COLUMNS]].mean()
-            figures = (Figure.of(means[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
-            rows.append((f"{car}, {kind} ({len(drives)} drives)", tuple(figures)))
-    return ("cars, known map", *(title for title, _, _ in COLUMNS.values())), tuple(rows)
+            figures = (Quantity.of(means[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
+            rows.append((f"{car}, {kind} ({len(drives)} drives)", *figures))
+    return Table(("cars, known map", *(title for title, _, _ in COLUMNS.values())), tuple(rows))

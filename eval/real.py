@@ -21,11 +21,11 @@ from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .experiment.cells import run_estimator
+from .experiment.tables import Quantity, Table
 from .metrics.accuracy import crossings
 from .metrics.alignment import aligned_distance, maps_apart
 from .metrics.registration import end_by_registration
 from .metrics.summary import summarize
-from .views import Figure, View
 
 RUNS: Final = {  # estimator of each run
     "online": registry.DEFAULT_ONLINE,
@@ -69,7 +69,7 @@ def map_real_log(folder: Path, out: Path) -> RealDrive:
     return RealDrive(folder.name, log, runs, cycles[-1].pose, end)
 
 
-def runs_table(drives: Sequence[RealDrive]) -> View:
+def runs_table(drives: Sequence[RealDrive]) -> Table:
     """Return a row for each run."""
     header = (
         *("log, run", "closed [%]", "end off by [m]", "turned by [°]"),
@@ -86,22 +86,22 @@ def runs_table(drives: Sequence[RealDrive]) -> View:
             ms = np.nan if name == "batch" else 1e3 * float(np.mean([r.seconds for r in run.cycles]))
             values = [100.0 * run.map.closed, *drive.off(run.trajectory[-1]), *reckoned, *crossed]
             values += [*(shares if any(health) else (np.nan, np.nan)), ms]
-            rows.append((f"{drive.name}, {name}", Figure.row(values, 0, 2, 1, 2, 1, 0, 0, 1, 1, 1)))
-    return header, tuple(rows)
+            rows.append((f"{drive.name}, {name}", *Quantity.row(values, 0, 2, 1, 2, 1, 0, 0, 1, 1, 1)))
+    return Table(header, tuple(rows))
 
 
-def maps_table(drives: Sequence[RealDrive]) -> View:
+def maps_table(drives: Sequence[RealDrive]) -> Table:
     """Return the distance between the maps of each two drives around the same cones: under a metre."""
     rows = []
     for first, second in combinations(drives, 2):
         both = zip(first.runs.values(), second.runs.values(), strict=True)
         apart = [aligned_distance(one.map, other.map) for one, other in both]
         if min(apart) < 1.0:
-            rows.append((f"{first.name}, {second.name}", Figure.row(apart, 2)))
-    return ("maps", *(f"{name} [m]" for name in RUNS)), tuple(rows)
+            rows.append((f"{first.name}, {second.name}", *Quantity.row(apart, 2)))
+    return Table(("maps", *(f"{name} [m]" for name in RUNS)), tuple(rows))
 
 
-def joint_table(drives: Sequence[RealDrive]) -> View:
+def joint_table(drives: Sequence[RealDrive]) -> Table:
     """Return how far each drive's own batch is from that of all drives, and both from the last pose."""
     alone = {drive.name: run for drive in drives if isinstance(run := drive.runs["batch"], BatchResult)}
     joint, rows = join(alone), []
@@ -113,12 +113,12 @@ def joint_table(drives: Sequence[RealDrive]) -> View:
         pose = compose(inverse(joint.frames[drive.name]), own.trajectory[-1])
         ends = drive.off(alone[drive.name].trajectory[-1])[0], drive.off(pose)[0]
         values = [apart["mean"], apart["rms"], apart["p95"], apart["max"], *ends]
-        rows.append((drive.name, Figure.row(values, 2)))
+        rows.append((drive.name, *Quantity.row(values, 2)))
     apart_by = ("map apart, mean [m]", "rms [m]", "p95 [m]", "largest [m]")
-    return ("drive", *apart_by, "end off by, alone [m]", "together [m]"), tuple(rows)
+    return Table(("drive", *apart_by, "end off by, alone [m]", "together [m]"), tuple(rows))
 
 
-def measured_table(drives: Sequence[RealDrive]) -> View:
+def measured_table(drives: Sequence[RealDrive]) -> Table:
     """Return what was measured on each drive, and over all of them the mean with its interval."""
     header = (
         *("log", "vx [m/s]", "vy [m/s]", "wz [rad/s]", "along at 10 m [m]", "across at 10 m [m]"),
@@ -135,9 +135,9 @@ def measured_table(drives: Sequence[RealDrive]) -> View:
         errors.append(found.sensor[places] * units)
         halves = 1.96 * found.sensor_sigma[places] * units
         pairs = zip(errors[-1].tolist(), halves.tolist(), strict=True)
-        found_errors = (Figure(v, h, 1) for v, h in pairs)
-        rows.append((drive.name, (*Figure.row(values, 4, 4, 4, 2, 2, 0, 0), *found_errors)))
+        found_errors = (Quantity(v, h, 1) for v, h in pairs)
+        rows.append((drive.name, *Quantity.row(values, 4, 4, 4, 2, 2, 0, 0), *found_errors))
     if len(errors) > 1:
-        means = (Figure.of(column, 1) for column in np.transpose(errors))
-        rows.append(("all drives", (*[Figure(None)] * 7, *means)))
-    return header, tuple(rows)
+        means = (Quantity.of(column, 1) for column in np.transpose(errors))
+        rows.append(("all drives", *[Quantity(None)] * 7, *means))
+    return Table(header, tuple(rows))

@@ -17,19 +17,19 @@ from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.sim.mistakes import MISTAKES
 
 from . import real, views
-from .benchmark.measurement import measure_drive, metrics
+from .benchmark.measurement import figures, measure_drive
 from .benchmark.roads import QUICK, make_drives
-from .benchmark.scaling import measure_scaling, scaling_figures
-from .experiment.faults import at_strength, kinds, only, suite
+from .benchmark.scaling import measure_scaling, scaling_table
+from .experiment.faults import at_strength, fault_table, kinds, only, outcomes, suite
 from .experiment.frame import write_csv
 from .experiment.provenance import made
 from .experiment.run import run_study
 from .experiment.study import Baseline, Study, find_study, read_study_file
-from .experiment.tables import TextTable
+from .experiment.tables import Quantity, Table
 from .hints import HintStudy
 from .joint import JointStudy, joint_table
 from .known import KnownStudy, known_table
-from .views import ESTIMATORS, LANDMARKS, ONLINE, Figure, View
+from .views import ESTIMATORS, LANDMARKS, ONLINE
 
 ABLATIONS: Final = ("stations", "gauge", "robust", "density", "lag", "relinearize", "degree", "covariance")
 """Studies of parts of the method, driven by one estimator on generated tracks for two laps."""
@@ -62,7 +62,7 @@ CENTRE_LINE: Final = (
     *("rmse", "missed", "nees", "inside", "centre", "centre_nees", "half_width", "half_width_nees"),
 )
 
-Views = dict[str, View]  # tables of an experiment, by what follows its name; empty for the one of that name
+Tables = dict[str, Table]  # tables of an experiment, by what follows its name; empty for the one of that name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,7 @@ class Plan:
     jobs: int = 1
     on_cell: Callable[[int, int], None] | None = None  # observer of the progress of a study
 
-    def accuracy(self, folder: Path) -> Views:
+    def accuracy(self, folder: Path) -> Tables:
         """Drive every estimator on all tracks, with two seeds for three laps; later laps change little."""
         tracks: tuple[Path | int, ...] = GENERATED[:1] if self.quick else (*GENERATED, *self.tracks)
         estimators, laps = (ESTIMATORS[:3], 2) if self.quick else (ESTIMATORS, 3)
@@ -92,20 +92,20 @@ class Plan:
             "reach": views.metrics_table(first, REACH),
         }
 
-    def skidpad(self, folder: Path) -> Views:
+    def skidpad(self, folder: Path) -> Tables:
         seeds, names = tuple(range(2 if self.quick else 10)), ESTIMATORS[: 2 if self.quick else 4]
         study = Study(name="skidpad", tracks=(Path("skidpad"),), estimators=names, seeds=seeds, laps=1)
         return {"": views.skidpad_table(self._run(study, folder))}
 
-    def camera(self, folder: Path) -> Views:
+    def camera(self, folder: Path) -> Tables:
         """Drive the study `camera` with one seed, whose noise is another one on each track."""
         return {"": views.camera_table(self._shipped("camera", folder, seeds=(0,))[1], CAMERA)}
 
-    def hard(self, folder: Path) -> Views:
+    def hard(self, folder: Path) -> Tables:
         study, frame = self._shipped("hard", folder, seeds=(0,))
         return {"": views.laps_table(frame, (1, 2, study.laps), CLOSING)}
 
-    def lines(self, folder: Path) -> Views:
+    def lines(self, folder: Path) -> Tables:
         """Drive the study `lines`, and the landmark graph where points are 4 m apart: each is a landmark."""
         study, frame = self._shipped("lines", folder / "curves", seeds=(0,))
         name = "4 m"
@@ -113,16 +113,16 @@ class Plan:
         frame = pd.concat([frame, self._run(beside, folder / "landmarks")], ignore_index=True)
         return {"": views.runs_table(frame, ("noise", "estimator"), LINES)}
 
-    def endurance(self, folder: Path) -> Views:
+    def endurance(self, folder: Path) -> Tables:
         study, frame = self._shipped("endurance", folder, laps=30)
         shown = [lap for lap in (3, 10, 30) if lap <= study.laps] or [study.laps]
         return {"": views.laps_table(frame, shown, ("rmse", "inside", "nees", "ate"))}
 
-    def centerline(self, folder: Path) -> Views:
+    def centerline(self, folder: Path) -> Tables:
         """Drive estimators of two boundaries, whose centre line is compared with the true one."""
         return {"": views.metrics_table(self._shipped("centerline", folder, seeds=(0,))[1], CENTRE_LINE)}
 
-    def ablation(self, folder: Path) -> Views:
+    def ablation(self, folder: Path) -> Tables:
         """Drive the study of the folder's name for two laps, under the first and the last of its noises.
 
         One drive on each of four tracks: drives of one track are no independent samples.
@@ -132,35 +132,35 @@ class Plan:
         small: dict[str, Any] = {"laps": 2, "noise": dict([noises[0], noises[-1]])}
         return {"": views.study_table(*self._shipped(name, folder, tracks=(0, 1, 2, 3), seeds=(0,), **small))}
 
-    def faults(self, folder: Path) -> Views:
+    def faults(self, folder: Path) -> Tables:
         """Drive the suite of faults at the middle strengths."""
         study = at_strength(suite(), 0.5)
         if self.quick:
             study = replace(only(study, kinds(study)[:1]), tracks=(0,), laps=1)
-        return {"": views.faults_table(study, self._run(study, folder))}
+        return {"": fault_table(study, outcomes(study, self._run(study, folder)))}
 
-    def hints(self, folder: Path) -> Views:
+    def hints(self, folder: Path) -> Tables:
         small: dict[str, Any] = {"mistakes": tuple(MISTAKES)[:2]} if self.quick else {}
         study = HintStudy(tracks=GENERATED[: 1 if self.quick else 3], seeds=(0,), **small)
         return {"": views.hints_table(study.measure(folder=folder, **self._how))}
 
-    def joint(self, folder: Path) -> Views:
+    def joint(self, folder: Path) -> Tables:
         small: dict[str, Any] = {"tracks": (50,), "drives": 2} if self.quick else {}
         return {"": joint_table(JointStudy(**small).measure(folder=folder, **self._how))}
 
-    def known(self, folder: Path) -> Views:
+    def known(self, folder: Path) -> Tables:
         small: dict[str, Any] = {"tracks": (60,), "begins": (0.3,)} if self.quick else {}
         return {"": known_table(KnownStudy(**small).measure(folder=folder, **self._how))}
 
-    def speed(self, _: Path) -> Views:
+    def speed(self, _: Path) -> Tables:
         """Time every estimator in turn on the same cycles."""
         seeds, laps = (GENERATED[:1], 1) if self.quick else (GENERATED, 5)
-        runs = [{m.key: m.value for m in metrics(measure_drive(seed, laps))} for seed in seeds]
+        runs = [figures(measure_drive(seed, laps)) for seed in seeds]
         values = pd.DataFrame(runs).reindex(columns=[*SPEED])
-        rows = ((label, (Figure.of(values[key], digits),)) for key, (label, digits) in SPEED.items())
-        return {"": (("figure", "measured"), tuple(rows))}
+        rows = ((label, Quantity.of(values[key], digits)) for key, (label, digits) in SPEED.items())
+        return {"": Table(("figure", "measured"), tuple(rows))}
 
-    def real_logs(self, folder: Path) -> Views:
+    def real_logs(self, folder: Path) -> Tables:
         if not self.real:
             raise SettingsError("--only real: expected logs in --real, found none")
         drives = [real.map_real_log(log, folder) for log in self.real]
@@ -171,12 +171,10 @@ class Plan:
             "measured": real.measured_table(drives),
         }
 
-    def scale(self, folder: Path) -> Views:
+    def scale(self, folder: Path) -> Tables:
         settings = QUICK if self.quick else ScalingSettings(cones_max=800.0, laps=10)
         scaling = measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings, folder=folder)
-        header, found = scaling_figures(scaling)
-        rows = ((name, Figure.row((value for value, _ in row), 2)) for name, row in found.items())
-        return {"": (header, tuple(rows))}
+        return {"": scaling_table(scaling)}
 
     def _shipped(self, name: str, folder: Path, **small: Any) -> tuple[Study, pd.DataFrame]:
         """Drive a shipped study, made smaller: with `quick` the first variant for one lap."""
@@ -195,7 +193,7 @@ class Plan:
         return {"jobs": self.jobs, "on_cell": self.on_cell}
 
 
-EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Views]]] = {
+EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Tables]]] = {
     "accuracy": Plan.accuracy,
     "skidpad": Plan.skidpad,
     "camera": Plan.camera,
@@ -216,30 +214,16 @@ QUICKEST: Final = ("accuracy", "skidpad", "camera", "faults", "robust", "hints",
 """Experiments of a quick report: the others have no view of their own."""
 
 
-def write_report(plan: Plan, folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, TextTable]]:
+def write_report(plan: Plan, folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Table]]:
     """Run experiments, by default all that the plan has logs for; write and yield each table."""
     for name in names:
         check_name(name, EXPERIMENTS, "--only: expected an experiment")
     every = QUICKEST if plan.quick else [name for name in EXPERIMENTS if name != "real" or plan.real]
     for name in names or every:
-        for part, view in EXPERIMENTS[name](plan, folder / name).items():
+        for part, table in EXPERIMENTS[name](plan, folder / name).items():
             file = folder / f"{'_'.join(filter(None, (name, part)))}.csv"
-            write_csv(file, tidy(view, provenance(plan, name)))
-            yield (
-                file,
-                TextTable("", view[0], tuple((label, *map(str, figures)) for label, figures in view[1])),
-            )
-
-
-def tidy(view: View, about: Mapping[str, str]) -> pd.DataFrame:
-    """Return a row for each figure: its row and column in the table, value, half width, and what made it."""
-    (title, *columns), rows = view
-    figures = [
-        (label, column, *figure.texts)
-        for label, of_row in rows
-        for column, figure in zip(columns, of_row, strict=True)
-    ]
-    return pd.DataFrame(figures, columns=[title, "column", "value", "half_width"]).assign(**about)
+            write_csv(file, table.tidy().assign(**provenance(plan, name)))
+            yield file, table
 
 
 def provenance(plan: Plan, name: str) -> dict[str, str]:

@@ -14,6 +14,7 @@ from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.kind import with_kind
 from pathspace_graph.io.log import Log
+from pathspace_graph.io.overrides import override
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.scale import chosen_scale
@@ -111,6 +112,19 @@ def parameters_of(name: str) -> Any:
     """Return the default parameters of an estimator's own, a frozen dataclass; None where it has none."""
     made_of = getattr(maker_of(name), PARAMETERS, None)
     return None if made_of is None else made_of()
+
+
+def with_parameters(name: str, overrides: dict[str, Any], where: str = "") -> tuple[Any, dict[str, Any]]:
+    """Return the own parameters of an estimator with overrides of `NAME.field`, and the other overrides.
+
+    The parameters are None where it has none. A wrong field or value is a SettingsError.
+    """
+    default, prefix = parameters_of(name), f"{name}."
+    if default is None:
+        return None, overrides
+    own = {key.removeprefix(prefix): value for key, value in overrides.items() if key.startswith(prefix)}
+    rest = {key: value for key, value in overrides.items() if not key.startswith(prefix)}
+    return override(default, own, f"{where}.{name}".strip(".")), rest
 
 
 def reads(name: str, field: str) -> bool:

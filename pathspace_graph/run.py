@@ -5,10 +5,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from functools import cached_property
 from math import nan
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -24,6 +24,8 @@ from .errors import check_type
 from .health import Health
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
+
+Result = TypeVar("Result", bound=RunResult)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -330,3 +332,10 @@ class _Run:
 def settings_dict(settings: Any) -> dict[str, Any]:
     """Convert a dataclass of settings to nested dictionaries; empty for anything else."""
     return asdict(settings) if is_dataclass(settings) and not isinstance(settings, type) else {}
+
+
+def with_own(result: Result, parameters: Any) -> Result:
+    """Return a result whose settings have the own parameters of its estimator, as a section of its name."""
+    if parameters is None:
+        return result
+    return replace(result, settings=result.settings | {result.estimator: settings_dict(parameters)})

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace
 from functools import cache, partial
 from importlib import import_module
-from itertools import chain, takewhile
+from itertools import chain, product, takewhile
 from operator import attrgetter
 from pathlib import Path
 from types import CodeType, FrameType
@@ -334,7 +334,7 @@ def test_every_table_is_on_a_page_and_says_what_made_it(hooks: Any) -> None:
         assert f"](figures/{file.name})\n" in pages, file.name
         for row in hooks.read(file.name):
             assert row["commit"] and row["machine"] and re.fullmatch(r"20\d\d-\d\d-\d\d", row["date"])
-            assert row["command"].startswith("pathspace-graph report") and "--quick" not in row["command"]
+            assert re.match(r"pathspace-graph (report|ablate)\b(?!.*--quick)", row["command"])
 
 
 def test_a_line_that_links_figures_becomes_their_table(
@@ -367,7 +367,7 @@ def test_the_figures_of_the_readme_are_those_of_the_files(hooks: Any) -> None:
 
     ours, theirs = (row_of("accuracy_estimators", name) for name in ("fixed-lag", "landmark-fixed-lag"))
     compared = ("rmse [m]", "missed [%]", "size", "trajectory error (ATE) [m]")
-    pairs = [(ours[name], theirs[name]) for name in compared]
+    pairs: list[tuple[str, ...]] = [(ours[name], theirs[name]) for name in compared]
     for row in (
         row_of("accuracy_laps", "1"),
         row_of("accuracy_metrics", "curve distance, mapped to truth [m]"),
@@ -375,6 +375,10 @@ def test_the_figures_of_the_readme_are_those_of_the_files(hooks: Any) -> None:
         pairs.append((row["fixed-lag"], row["landmark-fixed-lag"]))
     isam2 = row_of("speed", "mean update relative to iSAM2 with known data association")["measured"]
     known = row_of("known", "drawn, another drive's (24 drives)")
+    for estimator, variant in product(("fixed-lag", "spline"), ("default", "pure projection")):
+        row = row_of("ablation", f"{estimator}, {variant}")
+        shown = (row["rmse [m]"], row["difference"], row["trajectory error (ATE) [m]"])
+        pairs.append(tuple(filter(None, shown)))
     readme = text_of(ROOT / "README.md")
     quoted = re.findall(r"[\d.]+ ± [\d.]+", readme)
     assert quoted == [isam2, known["pose error [m]"], *chain.from_iterable(pairs)]

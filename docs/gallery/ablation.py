@@ -7,9 +7,9 @@
 # %%
 from tempfile import mkdtemp
 
+from pathspace_graph.eval.experiment.plots import plot_differences
 from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.study import Study
-from pathspace_graph.eval.experiment.tables import plot_differences
 
 study = Study(
     tracks=(11, 12), seeds=(0,), laps=1, grids=({"lag": [1.0, 3.0]},), metrics=("rmse", "missed", "size")

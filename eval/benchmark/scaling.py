@@ -23,7 +23,8 @@ from pathspace_graph.eval.experiment.frame import write_csv
 from pathspace_graph.eval.experiment.provenance import code_of
 from pathspace_graph.eval.experiment.rows import rows_of
 from pathspace_graph.eval.experiment.runner import OnCell
-from pathspace_graph.eval.experiment.tables import TextTable
+from pathspace_graph.eval.experiment.statistics import Estimate
+from pathspace_graph.eval.experiment.tables import Quantity, Table
 from pathspace_graph.eval.figures import style
 from pathspace_graph.eval.figures.style import MARKERS, PALETTE, WIDTH
 from pathspace_graph.eval.metrics.summary import versions
@@ -114,39 +115,23 @@ def measure_scaling(
 # --- table and files -------------------------------------------------------------------------------------
 
 
-def scaling_figures(scaling: Scaling) -> tuple[tuple[str, ...], dict[str, list[tuple[float, float]]]]:
-    """Return the header, and the figures of each estimator with their standard errors, NaN where none."""
+def scaling_table(scaling: Scaling) -> Table:
+    """Return a row for each estimator: slopes with standard errors, times, the ratio to the first, memory."""
     settings, first = scaling.settings, scaling.estimators[0]
     header = (
         *("estimator", f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})", "slope, readings"),
         *(f"ms at {COMPARED_AT:g} cones", f"{first} / this", "most cones"),
         *("ms, lap 2", f"ms, lap {settings.laps}", "peak MB"),
     )
-    rows = {}
+    rows = []
     for name in scaling.estimators:
         slopes = (scaling.slope(sweep, name) for sweep in (CONES, READINGS))
-        both = [(float(slope["slope"]), float(slope["error"])) for slope in slopes]
+        both = (Quantity.estimated(Estimate(slope["slope"], slope["error"], 1), 2) for slope in slopes)
         at, laps = scaling.seconds_at(COMPARED_AT, name), scaling.of(LAPS, name).set_index("at")["seconds"]
         alone = [1e3 * at, scaling.seconds_at(COMPARED_AT, first) / at, scaling.of(CONES, name)["at"].max()]
         alone += [1e3 * laps.get(float(lap), math.nan) for lap in (2, settings.laps)]
-        rows[name] = [*both, *((float(value), math.nan) for value in (*alone, scaling.memory[name]))]
-    return header, rows
-
-
-def scaling_table(scaling: Scaling) -> TextTable:
-    """Return a row for each estimator: slopes, times, the ratio to the first, laps and memory."""
-    header, found = scaling_figures(scaling)
-    header, rows = (*header[:6], f"ms, lap 2 and {scaling.settings.laps}", header[8]), []
-    for name, row in found.items():
-        digits = (2, 2, 1, 2, 0, 1, 1, 1)
-        *cells, second, last, peak = (_number(*of, places) for of, places in zip(row, digits, strict=True))
-        rows.append((name, *cells, f"{second}, {last}", peak))
-    return TextTable("Time per update: slopes of the logarithms, +- standard error", header, tuple(rows))
-
-
-def _number(value: float, error: float, digits: int) -> str:
-    by = f" +- {error:.{digits}f}" if math.isfinite(error) else ""
-    return f"{value:.{digits}f}{by}" if math.isfinite(value) else "-"
+        rows.append((name, *both, *Quantity.row([*alone, scaling.memory[name]], 1, 2, 0, 1, 1, 1)))
+    return Table(header, tuple(rows), "Time per update: slopes of the logarithms, ± standard error")
 
 
 def stops(scaling: Scaling) -> list[str]:
@@ -200,7 +185,7 @@ def plot_scaling(scaling: Scaling) -> Figure:
                     last = scaling.of(sweep, name).iloc[-1]
                     axes.plot(last["at"], 1e3 * last["seconds"], "x", color=color, markersize=10.8)
             axes.set_xscale("log")
-        cones.set_ylabel("mean update (ms)")
+        cones.set_ylabel("mean update [ms]")
         ticks = [n for n in (50, 100, 200, 500, 1000, 2000) if n <= scaling.settings.cones_max]
         for axes, labelled in ((cones, ticks), (detections, scaling.settings.readings)):
             axes.xaxis.set_major_locator(FixedLocator(labelled))
@@ -216,7 +201,7 @@ def plot_laps(scaling: Scaling) -> Figure:
         figure = Figure(figsize=(WIDTH / 2, _HEIGHT), layout="constrained")
         axes = figure.subplots()
         _draw_sweep(axes, scaling, LAPS, linestyle="-")
-        axes.set_ylabel("mean update (ms)")
+        axes.set_ylabel("mean update [ms]")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         style.shared_legend(figure, columns=2)
     return figure

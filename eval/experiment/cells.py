@@ -18,7 +18,7 @@ from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.plausibility.diagnosis import diagnose
 from pathspace_graph.plausibility.hint import Hint
-from pathspace_graph.run import run_online
+from pathspace_graph.run import run_online, with_own
 from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -76,11 +76,12 @@ class EstimatorCell(Cell):
 def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> RunResult:
     """Run an online estimator, with its reach and its map at the end of each true lap, or a batch one."""
     if name not in registry.ONLINE:
-        return registry.make_batch(name, settings, log, parameters).solve(log)
+        return with_own(registry.make_batch(name, settings, log, parameters).solve(log), parameters)
     estimator, truth = registry.make_online(name, settings, log, parameters), log.truth
     observers = [ReachObserver(truth)] if has_cones(truth) and len(truth.poses) else []
     result = run_online(log, estimator, name=name, snapshot_times=lap_times(log), observers=observers)
-    return replace(result, reach=observers[0].rows) if observers else result
+    result = replace(result, reach=observers[0].rows) if observers else result
+    return with_own(result, parameters)
 
 
 def files_of(run: RunResult, log: Log, hints: Sequence[Hint]) -> dict[str, str]:

@@ -15,10 +15,11 @@ from pathspace_graph import estimators as registry
 from pathspace_graph.errors import check_name
 from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
-from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, UNKNOWN, Metric
+from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, Metric
 from pathspace_graph.eval.metrics.summary import has_cones, versions
 from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.map import read_map
+from pathspace_graph.io.overrides import Overrides
 from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory
 from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.settings.mapper import MapperSettings
@@ -29,9 +30,9 @@ from .frame import add_batch, write_csv
 from .plots import Drawn, blind_spot_figure, plot_maps
 from .run import Plan, make_plan, run_records
 from .runner import Record, run_folder
-from .statistics import difference, estimate
+from .statistics import Estimate, difference, estimate
 from .study import Baseline, Study
-from .tables import TextTable, group_starts
+from .tables import Quantity, Table
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
 RUN: Final = ("log", "estimator")
@@ -48,6 +49,7 @@ def plan_of(
     reference: str | None = None,
     settings: MapperSettings | None = None,
     ghosts: GhostSettings | None = None,
+    own: Overrides | None = None,
 ) -> Plan:
     """Return the plan of every estimator, or those named, on a log or a folder of logs.
 
@@ -65,6 +67,7 @@ def plan_of(
         logs={name: (folder,) for name, folder in log_folders(logs).items()},
         estimators=chosen,
         settings=settings or MapperSettings(),
+        own=own or {},
         baseline=Baseline(estimator=reference or default),
     )
     return make_plan(study, keep=True, ghosts=ghosts)
@@ -153,7 +156,7 @@ def _names(cell: EstimatorCell) -> dict[str, Any]:
 # --- tables ----------------------------------------------------------------------------------------------
 
 
-def tables(comparison: Comparison) -> dict[str, TextTable]:
+def tables(comparison: Comparison) -> dict[str, Table]:
     """Return the tables by the name of their files, differences only where runs can be paired."""
     short = paper_table(comparison) if comparison.has_truth else final_table(comparison, WITHOUT_TRUTH)
     found = {"table": short, "metrics": final_table(comparison)}
@@ -181,27 +184,25 @@ def paper_frame(comparison: Comparison) -> pd.DataFrame:
     return pd.DataFrame(rows).astype({"lap": "Int64"})
 
 
-def paper_table(comparison: Comparison) -> TextTable:
+def paper_table(comparison: Comparison) -> Table:
     """Return the paper's Table 1, lap by lap."""
     logs = ["logs"] if len(comparison.logs) > 1 else []
     rows = []
     for row in paper_frame(comparison).to_dict("records"):
         lap = ("end" if row["logs"] else "failed") if pd.isna(row["lap"]) else str(int(row["lap"]))
-        cells = (*(str(row[key]) for key in logs), *(_cell(metric, row) for metric in PAPER))
-        rows.append((row["estimator"], lap, *cells))
+        cells = (Quantity.measured(metric, row[metric.key], row[f"{metric.key}_half"]) for metric in PAPER)
+        rows.append((row["estimator"], lap, *(str(row[key]) for key in logs), *cells))
     header = ("estimator", "lap", *logs, *(metric.heading for metric in PAPER))
-    return TextTable(_title(comparison, "at the end of each lap"), header, tuple(rows), group_starts(rows))
+    return Table(header, tuple(rows), _title(comparison, "at the end of each lap"))
 
 
-def final_table(comparison: Comparison, keys: Sequence[str] = tuple(METRICS)) -> TextTable:
+def final_table(comparison: Comparison, keys: Sequence[str] = tuple(METRICS)) -> Table:
     """Return the means over the logs of metrics of whole logs, with a column for each estimator."""
     final, names = comparison.final, comparison.estimators
     known = [METRICS[key] for key in keys if key in final and final[key].astype(float).notna().any()]
-    rows = tuple(
-        (m.heading, *(m.text(m.over(final.loc[final["estimator"] == name, m.key])) for name in names))
-        for m in known
-    )
-    return TextTable(_title(comparison, "at the end of the log"), ("metric", *names), rows)
+    of = {name: final[final["estimator"] == name] for name in names}
+    rows = ((m.heading, *(Quantity.measured(m, m.over(of[name][m.key])) for name in names)) for m in known)
+    return Table(("metric", *names), tuple(rows), _title(comparison, "at the end of the log"))
 
 
 def paired_frame(comparison: Comparison) -> pd.DataFrame:
@@ -217,7 +218,7 @@ def paired_frame(comparison: Comparison) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["estimator", "reference", "metric", "mean", "low", "high", "pairs"])
 
 
-def paired_table(comparison: Comparison) -> TextTable:
+def paired_table(comparison: Comparison) -> Table:
     """Return the differences with their intervals: a row for each metric, a column for each estimator."""
     paired = paired_frame(comparison)
     others = [name for name in comparison.estimators if name != comparison.reference]
@@ -225,32 +226,29 @@ def paired_table(comparison: Comparison) -> TextTable:
     for metric in (METRICS[key] for key in _PAIRED):
         by_estimator = paired[paired["metric"] == metric.key].set_index("estimator")
         if by_estimator["mean"].notna().any():
-            rows.append((metric.heading, *(_interval(metric, by_estimator.loc[name]) for name in others)))
+            rows.append((metric.heading, *(_difference(metric, by_estimator.loc[name]) for name in others)))
     title = (
-        f"Difference from {comparison.reference}, mean [95 % interval] over {len(comparison.logs)} logs, "
+        f"Difference from {comparison.reference}, mean and 95 % interval over {len(comparison.logs)} logs, "
         "paired; * where 0 is outside of it. Positive: the reference has less."
     )
-    return TextTable(title, ("metric", *others), tuple(rows))
+    return Table(("metric", *others), tuple(rows), title)
 
 
-def _interval(metric: Metric, row: Any) -> str:
-    mean, low, high = (metric.factor * float(row[name]) for name in ("mean", "low", "high"))
-    if np.isnan(mean):
-        return UNKNOWN
-    digits = max(metric.digits, MEAN_DIGITS)
-    mark = "*" if low > 0.0 or high < 0.0 else ""
-    return f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]{mark}"
+def _difference(metric: Metric, row: pd.Series) -> str:
+    of = Estimate(row["mean"], row["high"] - row["mean"], row["pairs"])
+    mark = "*" if of.low > 0.0 or of.high < 0.0 else ""
+    return f"{Quantity.estimated(of, max(metric.digits, MEAN_DIGITS), metric.factor, '+')}{mark}"
 
 
-def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
+def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> Table:
     """Return Table 1 as in the paper: a row per lap, with rmse, missed and size under each estimator."""
     titles = "   ".join(metric.heading for metric in PAPER)
     header, rows = ("lap", *(f"{name}\n{titles}" for name in laps)), []
     for lap, beside in enumerate(zip_longest(*laps.values()), start=1):
         values = ({} if row is None else asdict(row) for row in beside)
-        three = ("   ".join(_cell(m, row).rjust(len(m.heading)) for m in PAPER) for row in values)
-        rows.append((str(lap), *three))
-    return TextTable("", header, tuple(rows), names=0)
+        texts = ([(m.text(row.get(m.key, np.nan)), len(m.heading)) for m in PAPER] for row in values)
+        rows.append((str(lap), *("   ".join(text.rjust(width) for text, width in three) for three in texts)))
+    return Table(header, tuple(rows), names=0)
 
 
 def _title(comparison: Comparison, when: str) -> str:
@@ -258,13 +256,6 @@ def _title(comparison: Comparison, when: str) -> str:
     logs = comparison.logs[0] if count == 1 else f"mean over {count} logs"
     missing = " (the log has no true cones, which rmse, missed and most other metrics need)"
     return f"{logs}, {when}{'' if comparison.has_truth else missing}"
-
-
-def _cell(metric: Metric, row: dict[Any, Any]) -> str:
-    """Return a value, with its spread where there is one."""
-    half = float(row.get(f"{metric.key}_half", np.nan))
-    spread = "" if np.isnan(half) else f" ± {metric.factor * half:.{metric.digits}f}"
-    return f"{metric.text(float(row.get(metric.key, np.nan)))}{spread}"
 
 
 # --- files -----------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -17,17 +17,34 @@ from matplotlib.figure import Figure
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.eval.figures import style
 from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, ORANGE, WIDTH
-from pathspace_graph.eval.metrics.metric import METRICS, UNKNOWN
+from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.io.files import write_json
 from pathspace_graph.plausibility.diagnosis import PRIOR_LIMIT
 
 from .frame import RUN, last_laps, write_csv, write_results
 from .study import Study, find_study, read_study_file
-from .tables import TextTable, group_starts
+from .tables import Quantity, Table
 
 CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
 FAULT_COLUMNS: Final = 4  # panels side by side in the figure of faults
 Values = Mapping[str, Any]  # values of an outcome by name
+COLUMNS: Final = {  # of the table of faults: value and digits
+    "runs": ("runs", 0),
+    "failed": ("failed", 0),
+    "rmse by clean": ("ratio_mean", 2),
+    "least": ("ratio_min", 2),
+    "most": ("ratio_max", 2),
+    "size by clean": ("size_ratio", 2),
+    "missed [%]": ("missed", 1),
+    "closed [%]": ("closed", 0),
+    "lost at the end [%]": ("lost", 0),
+    "largest error [m]": ("error_max", 1),
+    "called degraded [%]": ("reported_degraded", 1),
+    "called lost [%]": ("reported_lost", 1),
+    "reported [%]": ("reported", 0),
+    "longest time over 1 m off [s]": ("divergence_time", 1),
+    "longest way over 1 m off [m]": ("divergence_distance", 0),
+}
 _WORST: Final = ("error_max", "divergence_time", "divergence_distance")
 _MEASURED: Final = (
     *("rmse", "size", "missed", "closed_at_end", "lost_at_end"),
@@ -135,30 +152,30 @@ def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     return last.assign(reported=(last["notices"] != "") | (last["reported_lost"] > 0.0))
 
 
-def fault_table(study: Study, found: Sequence[Values]) -> TextTable:
-    """Return a row for each fault and strength, without columns that no run knows anything of."""
-    columns = {title: tuple(map(text, found)) for title, text in COLUMNS.items()}
-    kept = {title: texts for title, texts in columns.items() if not {"", UNKNOWN}.issuperset(texts)}
+def fault_table(study: Study, found: Sequence[Values]) -> Table:
+    """Return the cost of each fault relative to the clean run of its track, and how often it is reported."""
+    rows = []
+    for noise, values in zip(study.noise, found, strict=True):
+        runs = max(values["runs"], 1)
+        shares = {name: values[name] / runs for name in ("closed", "lost", "reported")}
+        known = {**values, **shares}
+        figures = [100.0 * known[key] if "%" in title else known[key] for title, (key, _) in COLUMNS.items()]
+        rows.append((noise, *Quantity.row(figures, *(digits for _, digits in COLUMNS.values()))))
     title = (
         f"{study.name}: {study.question} {len(study.tracks)} tracks, {len(study.seeds)} seeds, "
         f"{study.laps} laps, {', '.join(study.estimators)}. The rmse is the map's at the end by that "
-        "of the clean run on the same track and with the same seed, as its mean and its range. "
-        "Lost means more than 5 m off in the last second."
+        "of the clean run on the same track and with the same seed. Lost means more than 5 m off in the last "
+        "second."
     )
-    faults = map(fault_of, study.noise)
-    rows = tuple((f.kind, f.strength, *texts) for f, *texts in zip(faults, *kept.values(), strict=False))
-    return TextTable(title, ("fault", "strength", *kept), rows, group_starts(rows), names=2)
+    return Table(("fault", *COLUMNS), tuple(rows), title)
 
 
-def _ratio(values: Values) -> str:
-    ratio, with_map, runs = values["ratio_mean"], values["with_map"], values["runs"]
-    partly = "" if with_map == runs else f" ({with_map} of {runs})"
-    return "no map" if np.isnan(ratio) else f"{ratio:.2f}{partly}"
-
-
-def _closed(values: Values) -> str:
-    failed = f", {values['failed']} failed" if values["failed"] else ""
-    return f"{values['closed']} of {values['runs']}{failed}"
+def with_notices(table: Table, found: Sequence[Values]) -> Table:
+    """Return the table with what was said: calibrations far from their prior (sigmas), and notices."""
+    calibrations = (", ".join(f"{k} {v:+.1f}" for k, v in values["calibration"].items()) for values in found)
+    told = zip(table.rows, calibrations, map(_notices, found), strict=True)
+    header = (*table.header, "calibration by its prior's sigma", "notices")
+    return replace(table, header=header, rows=tuple((*row, *texts) for row, *texts in told))
 
 
 def _notices(values: Values) -> str:
@@ -166,32 +183,6 @@ def _notices(values: Values) -> str:
     short = {text: text if len(text) <= 60 else f"{text[:60].rstrip()} …" for text in values["notices"]}
     said = (f"{number} of {values['runs']}: {short[text]}" for text, number in values["notices"].items())
     return "; ".join(said) or "nothing"
-
-
-def _form(form: str, *names: str, factor: float = 1.0) -> Callable[[Values], str]:
-    """Return a function that formats some of the values."""
-    return lambda values: (
-        UNKNOWN if np.isnan(values[names[0]]) else form.format(*(factor * values[name] for name in names))
-    )
-
-
-COLUMNS: Final[Mapping[str, Callable[[Values], str]]] = {  # columns after fault and strength
-    "rmse by clean": _ratio,
-    "range": _form("{:.1f} to {:.1f}", "ratio_min", "ratio_max"),
-    "size by clean": _form("{:.2f}", "size_ratio"),
-    "missed [%]": _form("{:.1f}", "missed", factor=100.0),
-    "closed": _closed,
-    "lost at the end": lambda values: f"{values['lost']} of {values['runs']}",
-    "largest error [m]": _form("{:.1f}", "error_max"),
-    "over 1 m off after closing [s, m]": _form("{:.1f}, {:.1f}", "divergence_time", "divergence_distance"),
-    "calibration by its prior's sigma": lambda values: ", ".join(
-        f"{name} {value:+.1f}" for name, value in values["calibration"].items()
-    ),
-    "called degraded, lost [% of cycles]": _form(
-        "{:.1f}, {:.1f}", "reported_degraded", "reported_lost", factor=100.0
-    ),
-    "notices": _notices,
-}
 
 
 # --- figure and files ------------------------------------------------------------------------------------
@@ -254,7 +245,7 @@ def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool
 def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Write the results of every run, and the table, the values and the figure; return the table's text."""
     faults = outcomes(study, frame)
-    table = fault_table(study, faults)
+    table = with_notices(fault_table(study, faults), faults)
     write_results(frame, out)
     table.write(out, "faults", "txt", "md", "tex")
     about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}
@@ -264,4 +255,4 @@ def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
         flat[key] = [json.dumps(value, ensure_ascii=False) for value in flat[key]]
     write_csv(out / "faults.csv", flat)
     style.save_figures(out, {"faults": plot_faults(study, beside_clean(frame))})
-    return f"{table.title}\n\n{table.text()}\n"
+    return table.text()

@@ -1,28 +1,33 @@
-"""Maps side by side over the truth: whole tracks, and the stretch where landmarks miss most cones."""
+"""Maps side by side, the stretch where landmarks miss most cones, and the differences of a study."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.spatial import KDTree
 
 from pathspace_graph.eval.figures import map_plot, style
 from pathspace_graph.eval.figures.map_plot import MARGIN, WHOLE_TRACK, MapStyle
-from pathspace_graph.eval.figures.style import RED, WIDTH
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, RED, WIDTH
 from pathspace_graph.eval.metrics.accuracy import MISSED_DISTANCE, cone_distances, mapped_points
-from pathspace_graph.eval.metrics.metric import PAPER
+from pathspace_graph.eval.metrics.metric import METRICS, PAPER
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES
 
+from .frame import Contrast, contrasts
+from .study import Study
+
 COLUMNS: Final = (2, 3, 4)  # maps side by side; the first with which the figure fits a page is taken
 MAX_HEIGHT: Final = 10.0  # height of a page (in)
 HALF_SIZE: Final = np.array([17.0, 13.0])  # half width and half height of a blind spot's stretch (m)
 DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)  # distances (m) of a missed cone, as they are tried
+MAX_PANELS: Final = 3  # most metrics side by side in the figure of differences
 # style of a panel that shows a short stretch of a track
 CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, path_width=0.8)
 
@@ -161,3 +166,57 @@ def _caption(name: str, row: Mapping[str, Any]) -> str:
     known = [m for m in PAPER if row.get(m.key) is not None]
     *words, size = (f"{m.title} {m.text(float(row[m.key]))} {m.unit}".strip() for m in known)
     return "\n".join(filter(None, [name, ", ".join(words), size]))
+
+
+# --- differences of a study -------------------------------------------------------------------------------
+
+
+def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
+    """Draw pairs, mean and interval of each combination for the first metrics; None where no run differs."""
+    every = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
+    panels = [p for p in every if any(d != 0.0 for contrast in p for d in contrast.differences)][:MAX_PANELS]
+    if not panels:
+        return None
+    rows = [i for i in range(len(panels[0])) if any(panel[i].differences for panel in panels)]
+    names = [_name(study, panels[0][i]) for i in rows]
+    with style.figure_context():
+        figure = Figure(figsize=(WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
+        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, panel in zip(all_axes, panels, strict=True):
+            _draw_differences(axes, [panel[i] for i in rows])
+        all_axes[0].set_yticks(range(len(rows)), names)
+        all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
+        text = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
+        figure.supxlabel(text)
+    return figure
+
+
+def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
+    metric = METRICS[rows[0].metric]
+    rng = np.random.default_rng(0)
+    axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
+    for row, contrast in enumerate(rows):
+        if contrast.difference is None or not contrast.difference.count:
+            continue
+        color = BLUE if contrast.significant else GREY
+        pairs = metric.factor * np.array(contrast.differences)
+        scattered = row + rng.uniform(-0.22, 0.22, len(pairs))  # so that they can be seen apart
+        axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=3.5, zorder=2)
+        mean, half = metric.factor * contrast.difference.mean, metric.factor * contrast.difference.half
+        look: dict[str, Any] = {"color": color, "markersize": 4.5, "elinewidth": 1.0}
+        axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", zorder=3, **look)
+    axes.set_title(metric.heading)
+    axes.grid(axis="x")
+
+
+def _name(study: Study, contrast: Contrast) -> str:
+    """Return the names of a combination that others have differently, `sigma_spacing=1` for
+    `gauge.sigma_spacing=1` unless two groups have a setting of one name."""
+    counts = {"noise": study.noises, "estimator": study.estimators, "variant": study.points}
+    several = [getattr(contrast, column) for column, of in counts.items() if len(of) > 1]
+    name = ", ".join(several) or f"{contrast.estimator}: {contrast.variant}"
+    last = {field: field.rpartition(".")[2] for field in study.varied}
+    if len(set(last.values())) == len(last):
+        for field, short in last.items():
+            name = name.replace(f"{field}=", f"{short}=")
+    return name

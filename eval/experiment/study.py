@@ -10,7 +10,7 @@ from typing import Any, Final
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError, check_name
 from pathspace_graph.eval.metrics.metric import METRICS, column_of
-from pathspace_graph.io.overrides import Overrides, flatten, override
+from pathspace_graph.io.overrides import Overrides, apart, flatten, override
 from pathspace_graph.io.parsing import MAX_HEADER_BYTES, MAX_VARIANTS, parse_toml, read_text, shown
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset
@@ -57,6 +57,8 @@ class Study:
     """Estimators to run, online and batch ones; `all` stands for every one."""
     settings: MapperSettings = field(default_factory=MapperSettings)
     """Settings of every estimator, which variants override."""
+    own: Overrides = field(default_factory=dict)
+    """Own parameters of estimators, `NAME.field`, which variants override."""
     noise: Mapping[str, Overrides] = field(default_factory=lambda: {"nominal": {}})
     """Overrides of the simulation by the name of a noise."""
     variants: Mapping[str, Overrides] = field(default_factory=dict)
@@ -183,13 +185,10 @@ class Study:
 
     def _variant(self, overrides: Overrides, where: str) -> Variant:
         """Return settings and parameters with overrides; those of `NAME.field` are of an estimator's own."""
-        parameters, rest = [], dict(overrides)
+        parameters, rest = list[tuple[str, Any]](), {**self.own, **overrides}
         for name in self.estimators:
-            default = registry.parameters_of(name)
-            if default is not None:
-                of = [key for key in rest if key.startswith(f"{name}.")]
-                own = {key.removeprefix(f"{name}."): rest.pop(key) for key in of}
-                parameters.append((name, override(default, own, f"{where}.{name}")))
+            own, rest = registry.with_parameters(name, rest, where)
+            parameters += [] if own is None else [(name, own)]
         return Variant(override(self.settings, rest, where), tuple(parameters))
 
 
@@ -236,7 +235,7 @@ def read_study_file(file: Path | str) -> Study:
 
 def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "study") -> Study:
     renamed = {"grids": "grid", "logs": "drives"}
-    known = [renamed.get(entry.name, entry.name) for entry in fields(Study)]
+    known = {renamed.get(entry.name, entry.name) for entry in fields(Study)} - {"own"}
     for key in content:
         check_name(key, known, "expected a known key")
     values: dict[str, Any] = {"name": name} | dict(content)
@@ -248,7 +247,8 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
     if "drives" in values:
         values["logs"] = _logs(_typed("drives", values.pop("drives"), Mapping), folder)
     if "settings" in values:
-        overrides = flatten(_typed("settings", values["settings"], Mapping))
+        given = flatten(_typed("settings", values["settings"], Mapping))
+        overrides, values["own"] = apart(given, registry.known_estimators(), MapperSettings())
         values["settings"] = override(MapperSettings(), overrides, "settings")
     for key in (key for key in ("noise", "variants") if key in values):
         tables = _typed(key, values[key], Mapping).items()

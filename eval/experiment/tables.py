@@ -1,19 +1,20 @@
-"""Tables in every form, and the files of a study: its tables, tidy results, and a figure of differences."""
+"""Tables in every form, and those of a study."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import repeat
+from math import isfinite, nan
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from rich.table import Table
+from numpy.typing import ArrayLike
+from rich.table import Table as RichTable
 from rich.text import Text
 from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
 
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH, figure_context, save_figures
+from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.metric import (
     HIGHER,
     LATER_LAPS,
@@ -28,39 +29,84 @@ from pathspace_graph.eval.metrics.metric import (
 from pathspace_graph.io.files import write_text
 
 from .frame import COMBINATION, RUN, RUN_OF, Contrast, contrasts, last_laps, write_results
-from .statistics import FEWEST, LEVEL, Estimate
+from .plots import plot_differences
+from .statistics import FEWEST, LEVEL, Estimate, estimate
 from .study import Study
-
-MAX_PANELS: Final = 3  # most metrics side by side in the figure of differences
 
 _UNICODE: Final = str.maketrans(  # LaTeX for characters that not every font has
     {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$", "×": r"$\times$"}
 )
-
-
-_STRONG: Final = ("\ue000", "\ue001")  # around what is bold, in the rows of a table
-
-
-def strong(text: str) -> str:
-    """Return a cell's text that is bold where the form of the table has that."""
-    return text.join(_STRONG)
+_MARKS: Final = ("\ue000", "\ue001")  # around what is bold until LaTeX is escaped
+_BOLD: Final = {"pipe": ("**", "**"), "latex_booktabs": (r"\textbf{", "}")}  # around what is bold, by form
 
 
 @dataclass(frozen=True)
-class TextTable:
-    """Rows of text under a header: first names, left-aligned, then numbers, right-aligned."""
+class Quantity:
+    """A measured value in the unit of a table, with half the width of its interval."""
 
-    title: str  # sentence above the table, which may be empty
+    value: float | None  # None where it is unknown
+    half: float | None = None
+    digits: int = 3  # number of digits after the decimal point
+    sign: str = ""  # `+` for a difference
+    is_best: bool = False  # whether it is bold where the form of the table has that
+
+    @classmethod
+    def estimated(cls, of: Estimate, digits: int = 3, factor: float = 1.0, sign: str = "") -> Self:
+        """Return a mean with its 95 % interval, times a factor."""
+        value, half = (factor * float(x) if isfinite(x) else None for x in (of.mean, of.half))
+        return cls(value, half, digits, sign)
+
+    @classmethod
+    def of(cls, values: ArrayLike, digits: int = 3, factor: float = 1.0) -> Self:
+        """Return the mean of the known values (n,), times a factor."""
+        array = np.asarray(values, float)
+        return cls.estimated(estimate(array[np.isfinite(array)]), digits, factor)
+
+    @classmethod
+    def measured(cls, metric: Metric, value: float, half: float = nan) -> Self:
+        """Return a value of a metric in its unit."""
+        return cls.estimated(Estimate(value, half, 1), metric.digits, metric.factor)
+
+    @classmethod
+    def row(cls, values: Iterable[float], *digits: int) -> tuple[Self, ...]:
+        """Return values without intervals, each with its own digits, or all with the same."""
+        every = digits if len(digits) > 1 else repeat(*digits)
+        return tuple(cls.estimated(Estimate(v, nan, 1), k) for v, k in zip(values, every, strict=False))
+
+    @property
+    def texts(self) -> tuple[str, str]:
+        """Value and half width of its interval, rounded; empty where they are not known."""
+        value = "" if self.value is None else f"{self.value:{self.sign}.{self.digits}f}"
+        return value, "" if self.half is None else f"{self.half:.{self.digits}f}"
+
+    def __str__(self) -> str:
+        return " ± ".join(filter(None, self.texts)) or UNKNOWN
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells under a header: first names, left-aligned, then texts or figures, right-aligned.
+
+    Rows of one first name are a group where several have it.
+    """
+
     header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    groups: tuple[int, ...] = ()  # row numbers at which a new group of rows begins
+    rows: tuple[tuple[object, ...], ...]  # texts and quantities
+    title: str = ""  # sentence above the table
     names: int = 1  # number of first columns that are names
     label: str = ""  # of the table in LaTeX
+
+    @property
+    def groups(self) -> tuple[int, ...]:
+        """Numbers of the rows at which a new group begins."""
+        starts = (k for k in range(1, len(self.rows)) if self.rows[k][0] != self.rows[k - 1][0])
+        return tuple(starts) if len({row[0] for row in self.rows}) < len(self.rows) else ()
 
     def parts(self, width: int) -> list[Self]:
         """Return tables of at most `width` characters, each with the names and some of the other columns."""
         border = 3  # characters between two columns
-        needed = [max(map(len, column)) + border for column in zip(self.header, *self.rows, strict=True)]
+        columns = zip(self.header, *self.rows, strict=True)
+        needed = [max(len(str(cell)) for cell in column) + border for column in columns]
         shared = sum(needed[: self.names]) + 1
         parts: list[list[int]] = [[]]
         for number in range(self.names, len(self.header)):
@@ -70,113 +116,133 @@ class TextTable:
         return [self._only([*range(self.names), *part]) for part in parts]
 
     def _only(self, columns: Sequence[int]) -> Self:
-        header, *rows = (tuple(row[k] for k in columns) for row in (self.header, *self.rows))
-        return replace(self, header=header, rows=tuple(rows))
+        rows = (tuple(row[k] for k in columns) for row in self.rows)
+        return replace(self, header=tuple(self.header[k] for k in columns), rows=tuple(rows))
 
-    def rich(self) -> Table:
+    def rich(self) -> RichTable:
         """Return the table for a terminal, without its title; units in brackets aren't taken for markup."""
-        table = Table()
+        table = RichTable()
         for number, name in enumerate(self.header):
             table.add_column(Text(name), justify="left" if number < self.names else "right")
         for number, row in enumerate(self.rows):
-            table.add_row(*(Text(_plain(cell)) for cell in row), end_section=number + 1 in self.groups)
+            table.add_row(*(Text(str(cell)) for cell in row), end_section=number + 1 in self.groups)
         return table
 
     def records(self) -> list[dict[str, str]]:
         """Return the rows as texts by the names of their columns."""
-        return [dict(zip(self.header, map(_plain, row), strict=True)) for row in self.rows]
+        return [dict(zip(self.header, map(str, row), strict=True)) for row in self.rows]
+
+    def tidy(self) -> pd.DataFrame:
+        """Return a row for each figure: its row and column in the table, its value and half width."""
+        figures = [
+            (row[0], column, *(cell.texts if isinstance(cell, Quantity) else (cell, "")))
+            for row in self.rows
+            for column, cell in zip(self.header[1:], row[1:], strict=True)
+        ]
+        return pd.DataFrame(figures, columns=[self.header[0], "column", "value", "half_width"])
 
     def text(self) -> str:
-        """Return the table for a text file, without its title: columns aligned by blanks."""
-        return self._formatted("simple", [[_plain(cell) for cell in row] for row in self.rows])
+        """Return the table for a text file: its title, and columns aligned by blanks."""
+        return f"{self._above}{self._formatted('simple')}\n"
 
     def markdown(self) -> str:
-        rows = [[_with(cell.replace("|", r"\|"), "**", "**") for cell in row] for row in self.rows]
-        title = f"{self.title}\n\n" if self.title else ""
-        return f"{title}{self._formatted('pipe', rows)}\n"
+        return f"{self._above}{self._formatted('pipe')}\n"
 
     def latex(self) -> str:
         """Return a `table` environment in LaTeX, with the title as its caption; it needs booktabs."""
-        rows: list[Sequence[str] | str] = []
-        for number, row in enumerate(self.rows):
-            rows += [SEPARATING_LINE, row] if number in self.groups else [row]
         caption = "".join(LATEX_ESCAPE_RULES.get(character, character) for character in self.title)
         begin = ["% \\usepackage{booktabs}", r"\begin{table}", r"\centering", rf"\caption{{{caption}}}"]
         begin += [rf"\label{{{self.label}}}"] if self.label else []
-        table = _with(self._formatted("latex_booktabs", rows), r"\textbf{", "}")
-        return "\n".join([*begin, table, r"\end{table}", ""]).translate(_UNICODE)
+        return "\n".join([*begin, self._formatted("latex_booktabs"), r"\end{table}", ""]).translate(_UNICODE)
 
     def write(self, folder: Path, name: str, *suffixes: str) -> None:
-        """Write the table to a folder as `txt` (with its title), `md` or `tex`."""
-        title = f"{self.title}\n\n" if self.title else ""
-        forms = {"txt": lambda: f"{title}{self.text()}\n", "md": self.markdown, "tex": self.latex}
+        """Write the table to a folder as `txt`, `md` or `tex`."""
         for suffix in suffixes:
-            write_text(folder / f"{name}.{suffix}", forms[suffix]())
+            write_text(folder / f"{name}.{suffix}", FORMS[suffix](self))
 
-    def _formatted(self, style: str, rows: Sequence[Sequence[str] | str]) -> str:
+    @property
+    def _above(self) -> str:
+        return f"{self.title}\n\n" if self.title else ""
+
+    def _formatted(self, style: str) -> str:
+        rows: list[Sequence[str] | str] = []
+        for number, row in enumerate(self.rows):
+            rows += [SEPARATING_LINE] * (style == "latex_booktabs" and number in self.groups)
+            rows.append([_cell(cell, style) for cell in row])
         sides = ["left"] * self.names + ["right"] * (len(self.header) - self.names)
-        return str(tabulate(rows, self.header, tablefmt=style, colalign=sides, disable_numparse=True))
+        text = str(tabulate(rows, self.header, tablefmt=style, colalign=sides, disable_numparse=True))
+        for mark, bold in zip(_MARKS, _BOLD.get(style, ()), strict=False):
+            text = text.replace(mark, bold)
+        return text
 
 
-def _with(text: str, before: str, after: str) -> str:
-    return text.replace(_STRONG[0], before).replace(_STRONG[1], after)
+def _cell(cell: object, style: str) -> str:
+    text = str(cell).replace("|", r"\|") if style == "pipe" else str(cell)
+    return text.join(_MARKS) if style in _BOLD and isinstance(cell, Quantity) and cell.is_best else text
 
 
-def _plain(text: str) -> str:
-    return _with(text, "", "")
-
-
-def group_starts(rows: Sequence[Sequence[str]]) -> tuple[int, ...]:
-    """Return the numbers of the rows whose first name is not that of the row before."""
-    return tuple(k for k in range(1, len(rows)) if rows[k][0] != rows[k - 1][0])
+FORMS: Final[Mapping[str, Callable[[Table], str]]] = {
+    "txt": Table.text,
+    "md": Table.markdown,
+    "tex": Table.latex,
+}
+"""Forms of a table by the suffix of its file."""
 
 
 # --- tables of studies ---------------------------------------------------------------------------------
 
 
-def summary_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
+def summary_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
     """Return a table for each metric of the study that its runs have."""
-    several, tables = [name for name in COMBINATION if frame[name].nunique() > 1] or ["variant"], []
+    several, tables = names_of(frame, "variant"), []
     for metric in (METRICS[key] for key in study.metrics if key in frame):
         rows = []
         for contrast in contrasts(study, frame, metric.key):
-            names = (getattr(contrast, name) for name in several)
-            value, difference = contrast.value, contrast.difference
-            by = ("baseline", "") if difference is None else _figures(metric, difference, "+")
+            names, difference = (getattr(contrast, name) for name in several), contrast.difference
+            by = "baseline" if difference is None else _mean(metric, difference, "+")
             tested = (_p(contrast.p), _p(contrast.wilcoxon), "*" if contrast.significant else "")
-            rows.append((*names, str(contrast.runs), *_figures(metric, value), *by, *tested))
-        header = (*several, "runs", "mean", "95 %", "difference", "95 %", "p", "Wilcoxon", "")
-        tables.append(TextTable(metric.heading, header, tuple(rows), names=len(several)))
+            rows.append((*names, str(contrast.runs), _mean(metric, contrast.value), by, *tested))
+        header = (*several, "runs", "mean", "difference", "p", "Wilcoxon", "")
+        tables.append(Table(header, tuple(rows), metric.heading, names=len(several)))
     return tables
+
+
+def names_of(frame: pd.DataFrame, otherwise: str) -> list[str]:
+    """Return the columns in which the combinations differ, or another one where there is only one."""
+    return [name for name in COMBINATION if frame[name].nunique() > 1] or [otherwise]
 
 
 def results_table(
     study: Study, frame: pd.DataFrame, keys: Sequence[str] = (), label: str = "tab:results"
-) -> TextTable:
+) -> Table:
     """Return a row for each combination and a column for each metric, by default those of the study.
 
     A cell is the mean and its interval over the tracks, at the end of the last lap. The best mean of a noise
     is bold, where a metric has a best.
     """
     shown = [METRICS[key] for key in keys or study.metrics if key in frame]
-    several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["estimator"]
-    columns = {metric.key: contrasts(study, frame, metric.key) for metric in shown}
+    several = names_of(frame, "estimator")
+    columns = [contrasts(study, frame, metric.key) for metric in shown]
     rows = []
-    for row, first in enumerate(columns[shown[0].key]) if shown else ():
-        cells = [_mean(metric, columns[metric.key], row) for metric in shown]
-        rows.append((*(getattr(first, name) for name in several), *cells))
-    header, names = (*several, *(metric.heading for metric in shown)), len(several)
+    for of_row in zip(*columns, strict=True):
+        means = (_mean(METRICS[one.metric], one.value) for one in of_row)
+        best = (_is_best(one, column) for one, column in zip(of_row, columns, strict=True))
+        cells = (replace(mean, is_best=is_best) for mean, is_best in zip(means, best, strict=True))
+        rows.append((*(getattr(of_row[0], name) for name in several), *cells))
+    header = (*several, *(metric.heading for metric in shown))
     title = f"{_about(study)} Mean and {_interval(frame)}{_laps(study)}."
-    return TextTable(title, header, tuple(rows), group_starts(rows), names, label)
+    return Table(header, tuple(rows), title, len(several), label)
 
 
-def _mean(metric: Metric, column: Sequence[Contrast], row: int) -> str:
-    """Return the mean of a combination with its interval, bold where it is the best of its noise."""
-    text = " ".join(filter(None, _figures(metric, column[row].value))) or UNKNOWN
-    sign = (metric.key in LOWER) - (metric.key in HIGHER)
-    means = [sign * of.value.mean for of in column if of.noise == column[row].noise and of.value.count]
-    is_best = bool(sign and len(means) > 1) and sign * column[row].value.mean <= min(means)
-    return strong(text) if is_best else text
+def _mean(metric: Metric, of: Estimate, sign: str = "") -> Quantity:
+    return Quantity.estimated(of, max(metric.digits, MEAN_DIGITS), metric.factor, sign)
+
+
+def _is_best(one: Contrast, column: Sequence[Contrast]) -> bool:
+    """Whether the mean of a combination is the best of those of its noise, where they differ."""
+    sign = (one.metric in LOWER) - (one.metric in HIGHER)
+    means = [sign * of.value.mean for of in column if of.noise == one.noise and of.value.count]
+    return bool(sign and len(set(means)) > 1) and sign * one.value.mean <= min(means)
 
 
 def _about(study: Study) -> str:
@@ -215,37 +281,24 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
     )
 
 
-def _figures(metric: Metric, of: Estimate, sign: str = "") -> tuple[str, str]:
-    if not of.count:
-        return "", ""
-    digits = max(metric.digits, MEAN_DIGITS)
-    half = "" if np.isnan(of.half) else f"± {metric.factor * of.half:.{digits}f}"
-    return f"{metric.factor * of.mean:{sign}.{digits}f}", half
+def joined(tables: Sequence[Table], caption: str, form: str) -> str:
+    """Return the tables of a study in a form of `FORMS`, below their caption; in LaTeX each has it."""
+    if form == "tex":
+        return "\n".join(replace(table, title=f"{table.title}. {caption}").latex() for table in tables)
+    if form == "md":
+        caption, tables = caption.replace("*", r"\*"), [replace(t, title=f"**{t.title}**") for t in tables]
+    return "\n".join([caption + "\n", *(FORMS[form](table) for table in tables)])
 
 
-def as_text(tables: Sequence[TextTable], caption: str) -> str:
-    return "\n\n".join([caption, *(f"{table.title}\n{table.text()}" for table in tables)]) + "\n"
-
-
-def as_markdown(tables: Sequence[TextTable], caption: str) -> str:
-    bold = (replace(table, title=f"**{table.title}**") for table in tables)
-    return "\n".join([caption.replace("*", r"\*") + "\n", *(table.markdown() for table in bold)])
-
-
-def as_latex(tables: Sequence[TextTable], caption: str) -> str:
-    """Return a `table` environment for each metric, each with the whole caption."""
-    return "\n".join(replace(table, title=f"{table.title}. {caption}").latex() for table in tables)
-
-
-def track_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
+def track_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
     """Return a table for each combination of noise, estimator and settings, if the study wants columns."""
     columns = [column_of(text) for text in study.columns]
     if not columns:
         return []
-    several = [name for name in COMBINATION if frame[name].nunique() > 1] or ["estimator"]
     header = ("track", "runs", *(column.title for column in columns))
+    titles = names_of(frame, "estimator")
     return [
-        TextTable(", ".join(str(runs[name].iloc[0]) for name in several), header, tuple(_rows(columns, runs)))
+        Table(header, tuple(_rows(columns, runs)), ", ".join(str(runs[name].iloc[0]) for name in titles))
         for _, runs in frame.groupby([*COMBINATION], sort=False)
     ]
 
@@ -281,60 +334,9 @@ def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Write results, times, figures and the summary in three forms, and return the text of the summary."""
     write_results(frame, out)
     tables, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
-    for suffix, form in (("txt", as_text), ("md", as_markdown), ("tex", as_latex)):
-        write_text(out / f"summary.{suffix}", form(tables, note))
+    for form in FORMS:
+        write_text(out / f"summary.{form}", joined(tables, note, form))
     results_table(study, frame).write(out, "table", "tex")
     figure = plot_differences(study, frame)
     save_figures(out / "figures", {} if figure is None else {"differences": figure})
-    return as_text(tables, note)
-
-
-def plot_differences(study: Study, frame: pd.DataFrame) -> Figure | None:
-    """Draw pairs, mean and interval of each combination for the first metrics; None where no run differs."""
-    every = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
-    panels = [p for p in every if any(d != 0.0 for contrast in p for d in contrast.differences)][:MAX_PANELS]
-    if not panels:
-        return None
-    rows = [i for i in range(len(panels[0])) if any(panel[i].differences for panel in panels)]
-    names = [_name(study, panels[0][i]) for i in rows]
-    with figure_context():
-        figure = Figure(figsize=(WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
-        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-        for axes, panel in zip(all_axes, panels, strict=True):
-            _draw_differences(axes, [panel[i] for i in rows])
-        all_axes[0].set_yticks(range(len(rows)), names)
-        all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
-        text = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
-        figure.supxlabel(text)
-    return figure
-
-
-def _draw_differences(axes: Axes, rows: Sequence[Contrast]) -> None:
-    metric = METRICS[rows[0].metric]
-    rng = np.random.default_rng(0)
-    axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
-    for row, contrast in enumerate(rows):
-        if contrast.difference is None or not contrast.difference.count:
-            continue
-        color = BLUE if contrast.significant else GREY
-        pairs = metric.factor * np.array(contrast.differences)
-        scattered = row + rng.uniform(-0.22, 0.22, len(pairs))  # so that they can be seen apart
-        axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=3.5, zorder=2)
-        mean, half = metric.factor * contrast.difference.mean, metric.factor * contrast.difference.half
-        look: dict[str, Any] = {"color": color, "markersize": 4.5, "elinewidth": 1.0}
-        axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", zorder=3, **look)
-    axes.set_title(metric.heading)
-    axes.grid(axis="x")
-
-
-def _name(study: Study, contrast: Contrast) -> str:
-    """Return the names of a combination that others have differently, `sigma_spacing=1` for
-    `gauge.sigma_spacing=1` unless two groups have a setting of one name."""
-    counts = {"noise": study.noises, "estimator": study.estimators, "variant": study.points}
-    several = [getattr(contrast, column) for column, of in counts.items() if len(of) > 1]
-    name = ", ".join(several) or f"{contrast.estimator}: {contrast.variant}"
-    last = {field: field.rpartition(".")[2] for field in study.varied}
-    if len(set(last.values())) == len(last):
-        for field, short in last.items():
-            name = name.replace(f"{field}=", f"{short}=")
-    return name
+    return joined(tables, note, "txt")

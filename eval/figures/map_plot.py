@@ -6,9 +6,8 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import PathPatch
-from matplotlib.path import Path as Outline
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.metrics.accuracy import mapped_points
@@ -99,13 +98,10 @@ def draw_boundary(
     color, name = BOUNDARY_COLORS[label], NAMES[label]
     exaggerated = "" if band_scale == 1.0 else f" (drawn {band_scale:g}× as wide)"
     if isinstance(boundary, PointBoundary):
-        area = {"alpha": BAND_ALPHA, "linewidth": 0.0}
-        own = style.point_blocks(boundary.covariance)
-        style.draw_ellipses(axes, boundary.points, own, color, band_scale, zorder=2, **area)
-        # a collection of ellipses has no key of its own in a legend: an empty patch lends it one
-        key = PathPatch(Outline(np.zeros((0, 2))), facecolor=color, **area)
-        key.set_label(f"{name} {style.SIGMAS:g}σ ellipses{exaggerated}")
-        axes.add_patch(key)
+        ellipses = style.ellipse_outlines(boundary.points, boundary.covariance, band_scale)
+        area: dict[str, Any] = {"facecolor": color, "alpha": BAND_ALPHA, "linewidth": 0.0, "zorder": 2}
+        text = f"{name} {style.SIGMAS:g}σ ellipses{exaggerated}"
+        axes.add_collection(PolyCollection(list(ellipses), label=text, **area))
         look_of = {"markersize": look.landmark_size, "zorder": 4}
         style.draw_points(axes, boundary.points, "o", color, f"{name} landmarks", **look_of)
         return
@@ -117,9 +113,9 @@ def draw_boundary(
     if until < spline.domain[1]:
         text, dashed = f"{name} tentative", {"linestyle": TENTATIVE_DASHES, "zorder": 4}
         style.draw_curve(axes, spline, color, text, look.curve_width, (until, np.inf), **dashed)
-    squares = {"markersize": look.marker_size, "markeredgewidth": 0.6, "zorder": 5}
+    squares: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 0.6, "zorder": 5}
     points, text = spline.distinct_control_points, f"{name} control points"
-    style.draw_control_points(axes, points, color, text, polygon=False, **squares)
+    style.draw_points(axes, points, "s", color, text, markersize=look.marker_size, **squares)
 
 
 def draw_orange(axes: Axes, points: Array, label: int, look: MapStyle) -> None:

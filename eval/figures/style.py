@@ -10,7 +10,6 @@ from typing import Any, Final
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
@@ -25,7 +24,7 @@ from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.spline.bspline import BSpline
 
 WIDTH: Final = 7.0  # width of a figure (in): two columns of a paper
-CURVE_WIDTH, THIN_WIDTH = 1.3, 0.5  # widths of a curve, and of the line of one sample among many (pt)
+CURVE_WIDTH: Final = 1.3  # width of a curve (pt)
 MARKER_SIZE: Final = 4.0  # size of a control point or a detection (pt)
 ALPHA: Final = 0.25
 
@@ -179,16 +178,6 @@ def draw_points(
     axes.plot(*points.T, linestyle="none", marker=marker, color=color, label=label, **options)
 
 
-def draw_control_points(
-    axes: Axes, points: Array, color: str, label: str | None = None, polygon: bool = True, **options: Any
-) -> None:
-    """Draw a square at each control point (k, 2), and the control polygon as a thin line if asked to."""
-    if polygon:
-        axes.plot(*points.T, color=color, linewidth=THIN_WIDTH, linestyle=(0, (4, 3)), zorder=2)
-    shape = {"markerfacecolor": "white", "markeredgewidth": 0.8, "zorder": 4}
-    draw_points(axes, points, "s", color, label, **shape | options)
-
-
 def draw_band(
     axes: Axes,
     boundary: SplineBoundary,
@@ -208,28 +197,16 @@ def draw_band(
     axes.add_patch(PathPatch(outline, facecolor=color, label=label, **look))
 
 
-def ellipse_outlines(points: Array, joint: Array) -> Array:
-    """Return the 2-sigma ellipse of each point (m, 2) as a closed line (m, 17, 2).
+def ellipse_outlines(points: Array, joint: Array, scale: float = 1.0) -> Array:
+    """Return the 2-sigma ellipse of each point (m, 2), `scale` times as large, as a closed line (m, 33, 2).
 
     The joint covariance (2m, 2m) is over x0, y0, x1, y1 and so on.
     """
     variances, vectors = np.linalg.eigh(point_blocks(joint))
-    angles = np.linspace(0.0, 2.0 * np.pi, 17)
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    angles = np.linspace(0.0, 2.0 * np.pi, 33)
+    circle = SIGMAS * scale * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     axes = vectors * np.sqrt(np.maximum(variances, 0.0))[:, None, :]
-    return np.asarray(points[:, None] + SIGMAS * np.einsum("cj,mij->mci", circle, axes))
-
-
-def draw_ellipses(
-    axes: Axes, centres: Array, covariances: Array, color: str, scale: float = 1.0, **options: Any
-) -> None:
-    """Draw the 2-sigma ellipses of points (k, 2) with covariances (k, 2, 2), `scale` times as large."""
-    variances, vectors = np.linalg.eigh(covariances)
-    widths, heights = 2.0 * SIGMAS * scale * np.sqrt(np.maximum(variances, 0.0)).T
-    angles = np.degrees(np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0]))
-    look = {"facecolor": color, "edgecolor": color, "alpha": ALPHA, "linewidth": 0.5, "zorder": 1} | options
-    place: dict[str, Any] = {"offsets": centres, "offset_transform": axes.transData}
-    axes.add_collection(EllipseCollection(widths, heights, angles, units="xy", **place, **look))
+    return np.asarray(points[:, None] + np.einsum("cj,mij->mci", circle, axes))
 
 
 # --- files -----------------------------------------------------------------------------------------------

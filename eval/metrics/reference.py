@@ -27,7 +27,7 @@ def limit(log: Log, track: Map) -> dict[str, float]:
     `l` is the rmse in the plane of the landmark batch with oracle association, `limit` that and the rmse of
     the true cones to splines of the mapped size that are fitted to them.
     """
-    truth = _truth(log)
+    truth = truth_of(log)
     landmarks, fit = landmark_rmse(solve_oracle_landmarks(log)[1], truth), fit_rmse(track, truth)
     return {"l": landmarks, "limit": float(np.hypot(landmarks, fit))}
 
@@ -38,7 +38,7 @@ def solve_oracle_landmarks(log: Log) -> tuple[LandmarkSystem, LandmarkState]:
     It also knows the sensor's constant errors, the bend of its ranges and the true noise, where the log has
     them.
     """
-    truth = _truth(log)
+    truth = truth_of(log)
     if truth.associations is None:
         raise ValueError("expected a simulated log, whose associations are known, found one without")
     settings = MapperSettings(calibration=CalibrationSettings(sensor=truth.sensor is None))
@@ -53,7 +53,7 @@ def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArr
     that reads `(1 + scale) r + bias + k max(r - begin, 0)^2`, and a covariance beside it, are inverted to
     first order in the noise.
     """
-    truth = _truth(log)
+    truth = truth_of(log)
     if truth.sensor is None and truth.bend is None:
         return log, associations
     yaw, lateral, latency, scale, bias = np.zeros(5) if truth.sensor is None else truth.sensor
@@ -87,7 +87,7 @@ def _true_ranges(measured: Array, scale: float, bend: Array) -> tuple[Array, Arr
 
 def with_true_covariances(log: Log) -> Log:
     """Return a log that states the true noise of single detections, where its truth has it."""
-    rays = _truth(log).rays
+    rays = truth_of(log).rays
     if rays is None:
         return log
     cycles = tuple(
@@ -103,7 +103,7 @@ def with_true_noise(log: Log, associations: IntArray) -> Log:
     independent ones times `1 + share (sum_ij exp(-|t_i - t_j| / time) / n - 1)`. The covariances are
     multiplied by it, along the ray and across.
     """
-    noise = _truth(log).noise
+    noise = truth_of(log).noise
     if noise is None:
         return log
     stamps = np.repeat([cycle.t for cycle in log.cycles], [len(cycle.labels) for cycle in log.cycles])
@@ -155,7 +155,7 @@ def fit_rmse(track: Map, truth: Truth) -> float:
     return root_mean_square(np.concatenate(distances))
 
 
-def _truth(log: Log) -> Truth:
+def truth_of(log: Log) -> Truth:
     if log.truth is None:
         raise ValueError("expected a log with truth, found one without")
     return log.truth

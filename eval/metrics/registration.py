@@ -92,10 +92,15 @@ def _registered(start: list[Array], end: list[Array], pose: Array) -> tuple[int,
         count = len(points)
         if count < LEAST:
             return 0, -np.inf, pose
-        centre, target = points.mean(axis=0), targets.mean(axis=0)
-        cross = (points - centre).T @ (targets - target)
-        turn = np.arctan2(cross[0, 1] - cross[1, 0], np.trace(cross))
-        moved = move_points(np.array([0.0, 0.0, turn]), centre[None])[0]
-        pose = np.append(target - moved, turn)
+        pose = motion_onto(points, targets)
         distance = float(np.hypot(*(move_points(pose, points) - targets).T).mean())
     return count, -distance, pose
+
+
+def motion_onto(points: Array, onto: Array) -> Array:
+    """Return the motion (3,) that leads points (n, 2) onto others, by least squares (Umeyama 1991)."""
+    middle, goal = points.mean(axis=0), onto.mean(axis=0)
+    a, b = (points - middle) @ [1.0, 1j], (onto - goal) @ [1.0, 1j]
+    turn = float(np.angle(np.vdot(a, b)))
+    turned = complex(*middle) * np.exp(1j * turn)
+    return np.array([goal[0] - turned.real, goal[1] - turned.imag, turn])

@@ -29,6 +29,7 @@ from pathspace_graph.io.files import check_file_target, check_target
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map
 from pathspace_graph.io.moved import moved_run
+from pathspace_graph.io.overrides import override
 from pathspace_graph.io.results import BatchRun, RunResult, write_result
 from pathspace_graph.io.ribbon import as_ribbon
 from pathspace_graph.labels import NAMES
@@ -38,7 +39,7 @@ from pathspace_graph.options.map import Batch, MapKind, Online, Plot
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.plausibility.judge import read_plausible_log
-from pathspace_graph.run import Observer, OnlineEstimator, run_online
+from pathspace_graph.run import Observer, OnlineEstimator, run_online, with_own
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.crossing import crossings_told
 
@@ -50,6 +51,7 @@ Run = TypeVar("Run", bound=RunResult)
 
 def online_command(options: Online) -> Outcome:
     check_online_options(options)
+    parameters = own_parameters(options)
     known = known_track(options)
     if options.plot is not None:
         plotting().check_picture(options.plot)
@@ -58,10 +60,10 @@ def online_command(options: Online) -> Outcome:
         viewing.check_watchers(options)
     log, hints = read_plausible_log(options.log, options.settings.limits)
     tell(hints)
-    log, estimator = begin(options, log) if known is None else begin_on(options, known, log)
+    log, estimator = begin(options, log, parameters) if known is None else begin_on(options, known, log)
     with nullcontext([]) if viewing is None else viewing.watchers(options, log) as observers:
         mapped = map_online(log, estimator, options.estimator, observers)
-        result = of_kind(mapped, options.map, options.settings)
+        result = of_kind(with_own(mapped, parameters), options.map, options.settings)
         differ = [] if known is None else known.differences(result, estimator)
         summarized = summarize(result, log, hints)
         summarized |= {} if known is None else known.summary(estimator, differ)
@@ -105,10 +107,21 @@ def check_online_options(options: Online) -> None:
         check_file_target(options.save)
 
 
-def begin(options: Online, log: Log) -> tuple[Log, OnlineEstimator]:
+def own_parameters(options: Online | Batch) -> Any:
+    """Return the estimator's own parameters with those of the file; InputError where something is wrong."""
+    try:
+        parameters, rest = estimators.with_parameters(options.estimator, options.own)
+        override(options.settings, rest, "")
+    except SettingsError as error:
+        raise InputError(options.file or "--settings", str(error)) from error
+    estimators.check_estimator(options.estimator, options.settings, parameters)
+    return parameters
+
+
+def begin(options: Online, log: Log, parameters: Any = None) -> tuple[Log, OnlineEstimator]:
     """Make an estimator for the log, or restore the saved mapper for the cycles that it has not seen."""
     if options.resume is None:
-        return log, estimators.make_online(options.estimator, options.settings, log)
+        return log, estimators.make_online(options.estimator, options.settings, log, parameters)
     mapper = FixedLagMapper.restore(options.resume)
     times = mapper.road.smoother.times
     cycles = tuple(cycle for cycle in log.cycles if not times or cycle.t > times[-1])
@@ -145,14 +158,16 @@ def batch_command(options: Batch) -> Outcome:
     if options.start == "odometry" and options.estimator != DEFAULT_BATCH:
         raise SettingsError(f"--start: expected online for {options.estimator}, found {options.start}")
     check_target(options.out, MAP_FILE)
+    parameters = own_parameters(options)
     if len(options.log) > 1:
         return batch_of_several(options)
     log, hints = read_plausible_log(options.log[0], options.settings.limits)
     tell(hints)
     with progress("optimizing") as advance:
-        estimator = estimators.make_batch(options.estimator, options.settings, log)
+        estimator = estimators.make_batch(options.estimator, options.settings, log, parameters)
         more = (options.start, advance) if isinstance(estimator, BatchMapper) else ()
-        result: BatchRun = of_kind(estimator.solve(log, *more), options.map, options.settings)
+        solved = with_own(estimator.solve(log, *more), parameters)
+        result: BatchRun = of_kind(solved, options.map, options.settings)
     summarized = summarize_batch(result, log, hints)
     write_result(options.out, result, summarized)
     report(result, log)

@@ -1,6 +1,6 @@
 """Dotted fields of a tree of settings, such as `spline.degree`, and overrides of them, also from a file."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import NoneType, UnionType
@@ -38,15 +38,28 @@ def override(settings: T, overrides: Overrides, where: str) -> T:
     return settings
 
 
-def read_settings(file: Path, settings: T) -> T:
-    """Override settings by a file, TOML or a run's `summary.json`; InputError for a bad one."""
+def apart(
+    overrides: Overrides, estimators: Iterable[str], settings: Any
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the overrides of settings, and those of estimators' own parameters, `NAME.field`."""
+    known, names = leaves(settings), set(estimators)
+    own = {k: v for k, v in overrides.items() if k not in known and k.partition(".")[0] in names}
+    return {k: v for k, v in overrides.items() if k not in own}, own
+
+
+def read_settings(file: Path, settings: T, estimators: Iterable[str] = ()) -> tuple[T, dict[str, Any]]:
+    """Return the settings with those of a file, and the own parameters of some estimators that it has.
+
+    The file is TOML or a run's `summary.json`. An InputError says what is wrong with the settings.
+    """
     text = read_text(file, "a file of settings", MAX_HEADER_BYTES)
     content = parse_json(text, file) if file.suffix == ".json" else parse_toml(text, file)
     table = content.get("settings", content) if isinstance(content, dict) else content
     if not isinstance(table, dict):
         raise InputError(file, f"expected a table of settings, found {shown(table)}")
     try:
-        return override(settings, flatten(table), "")
+        overrides, own = apart(flatten(table), estimators, settings)
+        return override(settings, overrides, ""), own
     except SettingsError as error:
         raise InputError(file, str(error)) from error
 

@@ -13,7 +13,7 @@ from typing import Any, Final, get_type_hints
 
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .parse import Option, options_of, parse
+from .parse import Option, options_of
 
 ESSENTIAL: Final = (  # settings of the estimators that `--help` explains; the others are in `--help-all`
     *("lag", "noise", "scale", "limits.range_max", "spline.degree", "spline.size_share"),
@@ -45,14 +45,6 @@ def help_of(command: type[Any], program: str, *, full: bool = False) -> str:
         lines += [f"--{name}.* ({n}): {_sentences(kind.__doc__)}" for (name, kind), n in groups.items()]
         lines += ["", f"{program} --help-all explains every option."]
     return "\n".join([*lines, ""])
-
-
-def read_options(command: type[Any], program: str) -> Any:
-    """Parse the options of a script, or print its help and exit."""
-    if "--help" in sys.argv:
-        print(help_of(command, program, full=True))
-        raise SystemExit(0)
-    return parse(command, program, sys.argv[1:])
 
 
 def _columns() -> int:

@@ -11,7 +11,7 @@ from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
 from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings, SpeedSettings
 
-from .parse import INLINE, PLACE
+from .parse import INLINE, NO_OPTION, PLACE
 
 MapKind = Literal["boundaries", "centerline"]
 Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]
@@ -22,8 +22,11 @@ class Estimation:
     """Options of every command that estimates."""
 
     file: Path | None = field(default=None, metadata={"name": "settings"})
-    """TOML file of settings, or the summary.json of a run; options on the command line override it."""
+    """TOML file of settings, or the summary.json of a run; options on the command line override it. A section
+    with the name of the estimator has parameters of its own."""
     settings: MapperSettings = field(default_factory=MapperSettings, metadata=INLINE)
+    own: dict[str, Any] = field(default_factory=dict, metadata=NO_OPTION)
+    """Own parameters of the estimators that are named, as `NAME.field`, from the file."""
 
     @classmethod
     def base(cls, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -31,7 +34,9 @@ class Estimation:
         if "settings" not in given:
             return {}
         overrides = import_module("pathspace_graph.io.overrides")  # the help need not wait for NumPy
-        return {"settings": overrides.read_settings(given["settings"], MapperSettings())}
+        names = given.get("estimators", [given.get("estimator")])
+        settings, own = overrides.read_settings(given["settings"], MapperSettings(), names)
+        return {"settings": settings, "own": own}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,8 @@
 """A command line as a frozen dataclass: each field is an option, each field of settings a dotted one.
 
 The metadata of a field say what its type does not: `name` is the option's name where it is not the field's,
-empty for settings without a prefix; `place` marks a positional argument; `words` are completed by the shell.
+empty for settings without a prefix, None for a field that no option sets; `place` marks a positional
+argument; `words` are completed by the shell.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,6 +17,7 @@ from pathspace_graph.errors import MAX_INTEGER, SettingsError, check_name
 
 PLACE: Final = {"place": True}
 INLINE: Final = {"name": ""}
+NO_OPTION: Final = {"name": None}
 SHOWN: Final = 80  # most characters of a wrong value in a message
 MANY: Final = 10_000  # most words of an option
 KINDS: Final[dict[Any, tuple[str, str]]] = {  # what an option takes: in a message, and in the help
@@ -139,6 +141,8 @@ def options_of(
     for name in (name for home in kind.__mro__ for name in get_annotations(home) if name in entries):
         entry, hint = entries[name], hints[name]
         shown = entry.metadata.get("name", name)
+        if shown is None:
+            continue
         if isinstance(hint, type) and is_dataclass(hint):
             own = group or (hint if shown else None)
             inside = f"{prefix}{shown}." if shown else prefix

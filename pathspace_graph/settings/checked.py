@@ -77,7 +77,7 @@ def is_of(value: Any, kind: Any) -> bool:
         return isinstance(value, tuple) and len(value) == len(each) and all(map(is_of, value, each))
     if kind in _NUMBER_KINDS:
         return isinstance(value, _NUMBER_KINDS[kind][0]) and not isinstance(value, bool)
-    return isinstance(value, kind)
+    return isinstance(value, get_origin(kind) or kind)
 
 
 def in_words(kind: Any) -> str:

@@ -59,9 +59,9 @@ def test_runs_that_fail_are_counted(
 
     monkeypatch.setattr(Fragile, "update", fail)
     assert main(options(track, tmp_path / "out", "fragile")) == 3
-    printed = capsys.readouterr()
-    assert "0 of 0, 1 failed" in printed.out
-    assert "7 of 7 cells failed, the first of ValueError: lost" in printed.err
+    assert "7 of 7 cells failed, the first of ValueError: lost" in capsys.readouterr().err
+    found = json.loads((tmp_path / "out" / "faults.json").read_text())["faults"]
+    assert [(row["runs"], row["failed"]) for row in found] == [(0, 1)] * 7
 
 
 def test_simulate_takes_faults(track: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,14 +8,13 @@ import pytest
 
 from pathspace_graph.eval.known import (
     KINDS,
-    OWN,
     begun_later,
     drive_on,
     known_table,
-    motion_onto,
     surveyed,
-    truth_of,
 )
+from pathspace_graph.eval.metrics.reference import truth_of
+from pathspace_graph.eval.metrics.registration import motion_onto
 from pathspace_graph.factors.se2 import compose, move_points
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.sim.track import to_map_frame
@@ -70,9 +69,9 @@ def test_the_table_has_a_row_for_each_kind_of_map_over_tracks() -> None:
         for kind in KINDS
         for track, found, error in ((0, 1.0, 0.1), (0, 0.0, np.nan), (1, 1.0, 0.3))
     ]
-    header, table = known_table(pd.DataFrame(rows))
-    assert header[0] == "cars, known map"
-    assert [label for label, _ in table] == [f"plain, {kind} (3 drives)" for kind in KINDS]
-    assert table[0][0].startswith(f"plain, {OWN}")
-    assert table[0][1][0].value == pytest.approx(75.0)  # not two thirds: each track counts once
-    assert table[0][1][3].value == pytest.approx(0.2)
+    table = known_table(pd.DataFrame(rows))
+    assert table.header[0] == "cars, known map"
+    every = table.records()
+    assert [row["cars, known map"] for row in every] == [f"plain, {kind} (3 drives)" for kind in KINDS]
+    assert every[0]["found [%]"].startswith("75 ±")  # not two thirds: each track counts once
+    assert every[0]["pose error [m]"].startswith("0.20 ±")

@@ -12,14 +12,12 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.eval import report
-from pathspace_graph.eval.experiment.faults import at_strength, suite
+from pathspace_graph.eval.experiment.faults import at_strength, fault_table, outcomes, suite
 from pathspace_graph.eval.experiment.study import Study
-from pathspace_graph.eval.report import CAMERA, tidy
+from pathspace_graph.eval.experiment.tables import Quantity, Table
+from pathspace_graph.eval.report import CAMERA
 from pathspace_graph.eval.views import (
-    Figure,
-    View,
     camera_table,
-    faults_table,
     laps_table,
     metrics_table,
     rmse_table,
@@ -44,46 +42,46 @@ def frame(estimator: str, laps: int, rmse: float) -> pd.DataFrame:
 BOTH = pd.concat([frame("fixed-lag", 3, 0.6), frame("spline", 3, 0.3)], ignore_index=True)
 
 
-def values(view: View, row: int) -> list[float | None]:
-    return [figure.value for figure in view[1][row][1]]
+def values(table: Table, row: int) -> list[float | None]:
+    return [cell.value for cell in table.rows[row] if isinstance(cell, Quantity)]
 
 
-def labels(view: View) -> list[str]:
-    return [label for label, _ in view[1]]
+def labels(table: Table) -> list[object]:
+    return [row[0] for row in table.rows]
 
 
 def test_a_figure_is_a_mean_with_its_interval_of_the_known_values() -> None:
     """Of 1, 2, 3 the sample's deviation is 1, and Student's t of 2 degrees is 4.303."""
-    figure = Figure.of(np.array([1.0, np.nan, 2.0, 3.0]), 1, 100.0)
+    figure = Quantity.of(np.array([1.0, np.nan, 2.0, 3.0]), 1, 100.0)
     assert figure.value == pytest.approx(200.0)
     assert figure.half == pytest.approx(100.0 * 4.302653 / np.sqrt(3.0), rel=1e-6)
     assert str(figure) == "200.0 ± 248.4"
-    assert str(Figure.of(np.array([2.0]))) == "2.000"
-    assert str(Figure.of(np.array([np.nan]))) == ""
+    assert str(Quantity.of(np.array([2.0]))) == "2.000"
+    assert str(Quantity.of(np.array([np.nan]))) == "–"
 
 
 def test_the_table_of_laps_has_the_online_map_and_the_batch() -> None:
-    view = laps_table(BOTH, (1, 2, 3, 3), ("rmse", "missed"))
-    assert view[0] == ("metric", "lap 1", "lap 2", "lap 3", "batch")
-    assert labels(view) == ["rmse [m]", "missed [%]"]
-    assert values(view, 0) == pytest.approx([0.6, 0.3, 0.2, 0.1])
-    assert values(view, 1) == pytest.approx([1.0] * 4)  # in percent
+    found = laps_table(BOTH, (1, 2, 3, 3), ("rmse", "missed"))
+    assert found.header == ("metric", "lap 1", "lap 2", "lap 3", "batch")
+    assert labels(found) == ["rmse [m]", "missed [%]"]
+    assert values(found, 0) == pytest.approx([0.6, 0.3, 0.2, 0.1])
+    assert values(found, 1) == pytest.approx([1.0] * 4)  # in percent
 
 
 def test_the_tables_of_accuracy_have_tracks_laps_and_metrics() -> None:
     two = pd.concat([BOTH, BOTH.assign(track="other", rmse=2.0 * BOTH["rmse"])], ignore_index=True)
-    view = tracks_table(two)
-    assert view[0][1:4] == ("rmse, lap 1 [m]", "rmse, last lap [m]", "rmse, batch [m]")
-    assert labels(view) == ["t", "other"]
-    assert values(view, 1)[:3] == pytest.approx([1.2, 0.4, 0.2])
-    assert view[1][0][1][0].half is None
-    view = rmse_table(two)
-    assert view[0] == ("rmse after lap [m]", "fixed-lag", "spline")
-    assert [values(view, lap)[0] for lap in range(3)] == pytest.approx([0.9, 0.45, 0.3])
-    view = metrics_table(two, ("rmse", "missed_2m"))
-    assert view[0] == ("metric", "fixed-lag", "spline")
-    assert values(view, 0) == pytest.approx([0.3, 0.15])
-    assert values(view, 1) == [None, None]
+    found = tracks_table(two)
+    assert found.header[1:4] == ("rmse, lap 1 [m]", "rmse, last lap [m]", "rmse, batch [m]")
+    assert labels(found) == ["t", "other"]
+    assert values(found, 1)[:3] == pytest.approx([1.2, 0.4, 0.2])
+    assert all(isinstance(cell, str) or cell.half is None for cell in found.rows[0])
+    found = rmse_table(two)
+    assert found.header == ("rmse after lap [m]", "fixed-lag", "spline")
+    assert [values(found, lap)[0] for lap in range(3)] == pytest.approx([0.9, 0.45, 0.3])
+    found = metrics_table(two, ("rmse", "missed_2m"))
+    assert found.header == ("metric", "fixed-lag", "spline")
+    assert values(found, 0) == pytest.approx([0.3, 0.15])
+    assert values(found, 1) == [None, None]
 
 
 def test_a_study_s_table_has_paired_differences_from_its_baseline() -> None:
@@ -92,12 +90,12 @@ def test_a_study_s_table_has_paired_differences_from_its_baseline() -> None:
     study = Study(tracks=(0,), seeds=(0, 1), grids=({"lag": [1.0]},), metrics=metrics)
     runs = frame("fixed-lag", 1, 0.3).assign(noise="nominal", variant="default", ms_mean=1.0)
     worse = runs.assign(variant="lag=1", rmse=runs["rmse"] + 0.1 * (1 + runs["seed"]))
-    view = study_table(study, pd.concat([runs, worse], ignore_index=True))
-    assert view[0] == ("variant", "rmse [m]", "difference", "p", "missed [%]")
-    assert labels(view) == ["default", "lag=1"]
-    assert values(view, 0)[:3] == [0.3, None, None]
-    assert str(view[1][1][1][1]) == "0.150 ± 0.635"
-    assert values(view, 1)[2] == pytest.approx(0.2048, abs=1e-3)
+    found = study_table(study, pd.concat([runs, worse], ignore_index=True))
+    assert found.header == ("variant", "rmse [m]", "difference", "p", "missed [%]")
+    assert labels(found) == ["default", "lag=1"]
+    assert values(found, 0)[:3] == [0.3, None, None]
+    assert found.records()[1]["difference"] == "0.150 ± 0.635"
+    assert values(found, 1)[2] == pytest.approx(0.2048, abs=1e-3)
 
 
 def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
@@ -108,19 +106,19 @@ def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
 
 def test_the_table_of_the_camera_ends_with_the_limit_of_landmarks() -> None:
     more = {"nees": 1.5, "l": 0.2, "reported_degraded": 0.25, "map_scale_nees": 0.8}
-    view = camera_table(BOTH.assign(**more), CAMERA)
-    assert view[0][:3] == ("estimator", "rmse [m]", "rmse without turn and scale [m]")
-    assert labels(view) == ["fixed-lag", "spline", "landmarks, given all"]
-    assert [values(view, row)[0] for row in range(3)] == pytest.approx([0.2, 0.1, 0.2])
-    assert values(view, 0)[-1] == pytest.approx(25.0) and values(view, 2)[-1] is None
+    found = camera_table(BOTH.assign(**more), CAMERA)
+    assert found.header[:3] == ("estimator", "rmse [m]", "rmse without turn and scale [m]")
+    assert labels(found) == ["fixed-lag", "spline", "landmarks, given all"]
+    assert [values(found, row)[0] for row in range(3)] == pytest.approx([0.2, 0.1, 0.2])
+    assert values(found, 0)[-1] == pytest.approx(25.0) and values(found, 2)[-1] is None
 
 
 def test_a_table_of_runs_has_a_row_for_each_noise_and_estimator() -> None:
     noises = pd.concat([BOTH.assign(noise=noise) for noise in ("1 m", "4 m")], ignore_index=True)
-    view = runs_table(noises, ("noise", "estimator"), ("rmse", "nees"))
-    assert view[0] == ("noise, estimator", "rmse [m]", "NEES per degree of freedom")
-    assert labels(view) == ["1 m, fixed-lag", "1 m, spline", "4 m, fixed-lag", "4 m, spline"]
-    assert values(view, 3) == [pytest.approx(0.1), None]
+    found = runs_table(noises, ("noise", "estimator"), ("rmse", "nees"))
+    assert found.header == ("noise, estimator", "rmse [m]", "NEES per degree of freedom")
+    assert labels(found) == ["1 m, fixed-lag", "1 m, spline", "4 m, fixed-lag", "4 m, spline"]
+    assert values(found, 3) == [pytest.approx(0.1), None]
 
 
 def test_the_table_of_faults_is_relative_to_the_clean_run_of_the_middle_strength() -> None:
@@ -133,17 +131,17 @@ def test_the_table_of_faults_is_relative_to_the_clean_run_of_the_middle_strength
         for noise, rmse, said in (("clean", 0.2, ""), (late, 0.3, "late"))
     ]
     pair = replace(study, noise={noise: study.noise[noise] for noise in ("clean", late)})
-    view = faults_table(pair, pd.concat(runs, ignore_index=True))
-    assert labels(view) == ["clean", late]
-    assert [str(figures[0]) for _, figures in view[1]] == ["1.00", "1.50"]
-    assert values(view, 1)[view[0].index("reported [%]") - 1] == 100.0
+    found = fault_table(pair, outcomes(pair, pd.concat(runs, ignore_index=True)))
+    assert labels(found) == ["clean", late]
+    assert [row["rmse by clean"] for row in found.records()] == ["1.00", "1.50"]
+    assert values(found, 1)[found.header.index("reported [%]") - 1] == 100.0
 
 
 def test_a_tidy_table_has_a_row_for_each_figure() -> None:
-    view = (("metric", "lap 1", "batch"), (("rmse [m]", (Figure(0.5, 0.1, 2), Figure(None))),))
-    assert tidy(view, {"commit": "abc1234"}).to_dict("records") == [
-        {"metric": "rmse [m]", "column": "lap 1", "value": "0.50", "half_width": "0.10", "commit": "abc1234"},
-        {"metric": "rmse [m]", "column": "batch", "value": "", "half_width": "", "commit": "abc1234"},
+    table = Table(("metric", "lap 1", "batch"), (("rmse [m]", Quantity(0.5, 0.1, 2), Quantity(None)),))
+    assert table.tidy().to_dict("records") == [
+        {"metric": "rmse [m]", "column": "lap 1", "value": "0.50", "half_width": "0.10"},
+        {"metric": "rmse [m]", "column": "batch", "value": "", "half_width": ""},
     ]
 
 

@@ -1,8 +1,7 @@
-"""A run of the benchmark whose times are known, and a small measurement of scaling."""
+"""A cycle whose time is known, and a small measurement of scaling."""
 
 from __future__ import annotations
 
-from pathspace_graph.eval.benchmark.measurement import Measurement
 from pathspace_graph.io.results import CycleRecord
 from pathspace_graph.settings.evaluation import ScalingSettings
 
@@ -22,9 +21,3 @@ SMALL = ScalingSettings(
 
 def record(cycle: int, seconds: float, lap: int, *, closed: bool = False) -> CycleRecord:
     return CycleRecord(cycle, 0.1 * cycle, seconds, 5, 5, 4, lap, {"update": 0.5 * seconds}, closed=closed)
-
-
-def steady_run(seconds: float = 0.002, closing: int = 99) -> Measurement:
-    """Three laps of 100 cycles that take equally long; the last one of lap 1 closes the loop."""
-    cycles = tuple(record(k, seconds, 1 + k // 100, closed=k >= closing) for k in range(300))
-    return Measurement(cycles, 3, (0.01,) * 300, (0.002,) * 300)

@@ -11,11 +11,11 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.eval.experiment.faults import (
-    COLUMNS,
     beside_clean,
     fault_table,
     outcomes,
     plot_faults,
+    with_notices,
     write_suite,
 )
 from pathspace_graph.eval.experiment.study import Study
@@ -87,29 +87,25 @@ def test_what_a_run_calls_itself_is_told_where_it_judges_its_health(frame: pd.Da
     clean, mild, _ = outcomes(STUDY, frame)
     assert mild["reported_lost"] == pytest.approx(0.2)
     assert (clean["reported"], mild["reported"]) == (0, 2)
-    table = fault_table(STUDY, [clean, mild])
-    assert table.rows[1][table.header.index("called degraded, lost [% of cycles]")] == "10.0, 20.0"
 
 
 def test_the_longest_way_astray_is_that_of_the_worst_run(frame: pd.DataFrame) -> None:
     frame["divergence_time"], frame["divergence_distance"] = np.arange(7.0), 10.0 * np.arange(7.0)
-    clean, mild, _ = outcomes(STUDY, frame)
-    table = fault_table(STUDY, [clean, mild])
-    column = table.header.index("over 1 m off after closing [s, m]")
-    assert [row[column] for row in table.rows] == ["2.0, 20.0", "4.0, 40.0"]
+    mild = fault_table(STUDY, outcomes(STUDY, frame)).records()[1]
+    assert mild["longest time over 1 m off [s]"] == "4.0"
+    assert mild["longest way over 1 m off [m]"] == "40"
 
 
-def test_the_table_has_the_columns_that_something_is_known_of(frame: pd.DataFrame) -> None:
-    table = fault_table(STUDY, outcomes(STUDY, frame))
-    unknown = "called", "over 1 m off"
-    known = (name for name in COLUMNS if not name.startswith(unknown))
-    assert table.header == ("fault", "strength", *known)
-    assert table.rows[0][:7] == ("clean", "", "1.00", "1.0 to 1.0", "1.00", "0.0", "2 of 2")
-    assert table.rows[1][2:8] == ("2.50", "1.5 to 3.5", "1.25", "5.0", "2 of 2", "1 of 2")
-    assert table.rows[1][-1] == "1 of 2: a notice"
-    assert table.rows[0][-1] == "nothing"
-    assert table.rows[2][2:7] == ("no map", "–", "1.00", "100.0", "0 of 1, 1 failed")
-    assert table.groups == (1,)
+def test_the_table_has_the_cost_of_each_fault_and_what_was_said(frame: pd.DataFrame) -> None:
+    found = outcomes(STUDY, frame)
+    clean, mild, strong = with_notices(fault_table(STUDY, found), found).records()
+    cost = ("rmse by clean", "least", "most", "size by clean", "missed [%]", "closed [%]")
+    assert [clean[name] for name in cost] == ["1.00", "1.00", "1.00", "1.00", "0.0", "100"]
+    assert [mild[name] for name in cost] == ["2.50", "1.50", "3.50", "1.25", "5.0", "100"]
+    assert [strong[name] for name in (*cost, "failed")] == ["–", "–", "–", "1.00", "100.0", "0", "1"]
+    assert (mild["lost at the end [%]"], mild["called lost [%]"]) == ("50", "–")
+    assert (clean["notices"], mild["notices"]) == ("nothing", "1 of 2: a notice")
+    assert mild["calibration by its prior's sigma"] == "scale error of the speeds -4.0"
 
 
 def test_the_figure_has_a_panel_for_each_fault_and_a_look_for_each_fate(frame: pd.DataFrame) -> None:

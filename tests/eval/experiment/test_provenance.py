@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
@@ -15,11 +16,14 @@ import numpy as np
 import pytest
 
 from pathspace_graph import estimators as registry
+from pathspace_graph.cli import main
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.experiment import provenance
 from pathspace_graph.eval.experiment.provenance import code_of, made
 from pathspace_graph.eval.experiment.run import run_study
-from pathspace_graph.eval.experiment.study import Study
+from pathspace_graph.eval.experiment.study import Study, read_study_file
+from pathspace_graph.io.log import write_log
+from pathspace_graph.io.map import PointBoundary, read_map
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -229,6 +233,47 @@ def test_own_parameters_are_varied_by_a_study(plugin: Path, tmp_path: Path) -> N
     assert other["cell"].nunique() == 1 and other["plugin.radius"].isna().all()
     with pytest.raises(SettingsError, match=r"grid.plugin: .*the nearest is 'radius'"):
         study(tmp_path, estimators=("plugin",), grids=({"plugin.radus": [2.0]},))
+
+
+def test_own_parameters_are_a_section_of_a_study_s_settings(plugin: Path, tmp_path: Path) -> None:
+    text = 'tracks = [0]\nestimators = ["plugin", "ckf"]\nsettings = {lag = 2.0, plugin.radius = 4.0}\n'
+    (tmp_path / "own.toml").write_text(f"{text}variants.wide.plugin.radius = 9.0\n")
+    points = read_study_file(tmp_path / "own.toml").points
+    radii = {name: dict(one.parameters)["plugin"].radius for name, one in points.items()}
+    assert radii == {"default": 4.0, "wide": 9.0}
+    assert points["default"].settings.lag == 2.0
+
+
+def test_own_parameters_are_a_section_of_a_settings_file(plugin: Path, tmp_path: Path) -> None:
+    """The summary has them, and is itself such a file."""
+    log, settings = tmp_path / "log", tmp_path / "own.toml"
+    write_log(noisy_lap(), log)
+    settings.write_text("lag = 1.0\n[plugin]\nradius = 7.0\n")
+    command = ["online", str(log), "--estimator", "plugin", "--lag", "2.0"]
+    for out in ("first", "again"):
+        assert main([*command, "--settings", str(settings), "--out", str(tmp_path / out)]) == 0
+        right = read_map(tmp_path / out).right
+        assert isinstance(right, PointBoundary)
+        assert right.points.tolist() == [[6.0, 0.0], [0.0, -7.0]]
+        settings = tmp_path / out / "summary.json"
+    assert json.loads(settings.read_text())["settings"]["plugin"] == {"radius": 7.0}
+
+
+@pytest.mark.parametrize(
+    ("estimator", "section", "told"),
+    [
+        ("plugin", "radus = 7.0", "plugin: expected a known setting, found 'radus', the nearest is 'radius'"),
+        ("plugin", "radius = 'wide'", "plugin.radius: expected a number, found 'wide'"),
+        ("ckf", "radius = 7.0", "expected a setting, found 'plugin.radius'"),
+    ],
+)
+def test_wrong_parameters_are_one_line(
+    plugin: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], estimator: str, section: str, told: str
+) -> None:
+    (tmp_path / "own.toml").write_text(f"[plugin]\n{section}\n")
+    options = ["--settings", str(tmp_path / "own.toml"), "--out", str(tmp_path / "out")]
+    assert main(["online", str(tmp_path), "--estimator", estimator, *options]) == 2
+    assert capsys.readouterr().err == f"pathspace-graph: {tmp_path / 'own.toml'}: {told}\n"
 
 
 def test_a_broken_plugin_is_found_before_the_first_cell(plugin: Path, tmp_path: Path) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.experiment.study import Study
-from pathspace_graph.eval.experiment.tables import TextTable, track_tables
+from pathspace_graph.eval.experiment.tables import Table, track_tables
 from pathspace_graph.eval.metrics.metric import METRICS, column_of
 
 RUNS = {  # rmse (m) of laps 1, 2 and 3
@@ -37,11 +39,11 @@ def frame(failed: tuple[str, int] | None = None, variant: str = "default") -> pd
     return pd.DataFrame(rows).astype({"lap": "Int64"})
 
 
-def table(*columns: str, of: pd.DataFrame | None = None) -> dict[str, tuple[str, ...]]:
+def table(*columns: str, of: pd.DataFrame | None = None) -> dict[str, tuple[Any, ...]]:
     """The one table's rows by their name."""
     (found,) = track_tables(Study(tracks=(0,), columns=columns), frame() if of is None else of)
     assert found.header[:2] == ("track", "runs")
-    return {row[0]: row[1:] for row in found.rows}
+    return {str(row[0]): row[1:] for row in found.rows}
 
 
 def test_a_column_is_of_the_last_lap_of_one_of_the_later_ones_or_of_all() -> None:
@@ -123,8 +125,8 @@ def test_yardsticks_are_true_or_false() -> None:
 
 
 def test_a_table_keeps_its_units_and_escapes_what_latex_would_take_for_commands() -> None:
-    rows = (("x|y", "2σ < 5 %"), ("z", "–"))
-    table = TextTable("50 % of a_b ± 1", ("name", "rmse [m]"), rows, groups=(1,))
+    rows = (("x|y", "2σ < 5 %"), ("z", "–"), ("z", "–"))
+    table = Table(("name", "rmse [m]"), rows, "50 % of a_b ± 1")
     assert table.rich().columns[1].header.plain == "rmse [m]"  # type: ignore[union-attr]
     latex = table.latex()
     assert r"\caption{50 \% of a\_b $\pm$ 1}" in latex and r"2$\sigma$ \ensuremath{<} 5 \%" in latex
@@ -132,8 +134,10 @@ def test_a_table_keeps_its_units_and_escapes_what_latex_would_take_for_commands(
 
 
 def test_names_are_aligned_to_the_left_and_numbers_to_the_right() -> None:
-    table = TextTable("Title", ("name", "a", ""), (("x|y", "1.0", ""), ("long name", "12.25", "*")))
-    assert [line.rstrip() for line in table.text().split("\n")] == [
+    table = Table(("name", "a", ""), (("x|y", "1.0", ""), ("long name", "12.25", "*")), "Title")
+    assert [line.rstrip() for line in table.text().splitlines()] == [
+        "Title",
+        "",
         "name           a",
         "---------  -----  --",
         "x|y          1.0",
@@ -146,7 +150,7 @@ def test_names_are_aligned_to_the_left_and_numbers_to_the_right() -> None:
 
 
 def test_a_table_too_wide_is_cut_into_parts_that_keep_the_names() -> None:
-    table = TextTable("", ("metric", "aaaaaaaa", "bbbbbbbb", "cc"), (("rmse", "1", "2", "3"),))
+    table = Table(("metric", "aaaaaaaa", "bbbbbbbb", "cc"), (("rmse", "1", "2", "3"),))
     assert [part.header for part in table.parts(200)] == [table.header]
     parts = table.parts(22)  # 10 for the names and the border, 11 for each wide column
     assert [part.header[1:] for part in parts] == [("aaaaaaaa",), ("bbbbbbbb",), ("cc",)]

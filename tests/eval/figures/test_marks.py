@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
 
 from pathspace_graph.eval.figures.style import (
     curve_parameters,
     draw_band,
-    draw_control_points,
-    draw_ellipses,
     ellipse_outlines,
     point_blocks,
     uncertainty_band,
@@ -79,34 +76,10 @@ def test_every_span_is_sampled_from_end_to_end() -> None:
     assert set(spline.breaks) <= set(u)
 
 
-def test_an_ellipse_lies_along_the_axes_of_its_covariance() -> None:
-    """Standard deviations of 0.3 m at 30 degrees and 0.1 m across it; the whole ellipse is four of each."""
-    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
-    axes_of_it = np.array([[c, -s], [s, c]])
-    covariance = axes_of_it @ np.diag([0.09, 0.01]) @ axes_of_it.T
-    axes = Figure().subplots()
-    draw_ellipses(axes, np.array([[5.0, 1.0]]), covariance[None], "black", scale=2.0)
-    (ellipses,) = axes.collections
-    assert isinstance(ellipses, EllipseCollection)
-    (width,), (height,), (angle,) = ellipses.get_widths(), ellipses.get_heights(), ellipses.get_angles()
-    # eigenvalues ascend, so the width is that of the short axis
-    assert (width, height) == pytest.approx((0.8, 2.4))
-    assert angle % 180.0 == pytest.approx(120.0)
-    np.testing.assert_array_equal(ellipses.get_offsets(), [[5.0, 1.0]])
-
-
 def test_a_points_own_covariance_is_a_block_of_the_joint_one() -> None:
     joint = np.arange(36.0).reshape(6, 6)
     np.testing.assert_array_equal(point_blocks(joint)[1], joint[2:4, 2:4])
     assert point_blocks(np.zeros((0, 0))).shape == (0, 2, 2)
-
-
-def test_a_control_polygon_is_drawn_if_asked_for() -> None:
-    axes = Figure().subplots()
-    draw_control_points(axes, np.zeros((3, 2)), "black", polygon=False)
-    assert len(axes.lines) == 1
-    draw_control_points(axes, np.zeros((3, 2)), "black")
-    assert len(axes.lines) == 3
 
 
 def test_an_outline_of_an_ellipse_is_two_sigma_away_in_every_direction() -> None:
@@ -114,9 +87,11 @@ def test_an_outline_of_an_ellipse_is_two_sigma_away_in_every_direction() -> None
     covariance = np.array([[4.0, 1.0], [1.0, 2.0]])
     joint = np.block([[np.eye(2), 0.1 * np.eye(2)], [0.1 * np.eye(2), covariance]])
     first, second = ellipse_outlines(points, joint)
-    assert first.shape == (17, 2)
+    assert first.shape == (33, 2)
     np.testing.assert_allclose(np.linalg.norm(first - points[0], axis=1), 2.0, rtol=1e-12)
     offset = second - points[1]
     squares = np.einsum("ci,ij,cj->c", offset, np.linalg.inv(covariance), offset)
     np.testing.assert_allclose(squares, 4.0, rtol=1e-12)
     np.testing.assert_allclose(second[0], second[-1], atol=1e-12)
+    wider, _ = ellipse_outlines(points, joint, 3.0)
+    np.testing.assert_allclose(wider - points[0], 3.0 * (first - points[0]), atol=1e-12)
