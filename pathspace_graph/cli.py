@@ -129,7 +129,7 @@ def help_of(name: str, *, full: bool = False) -> str:
 
 
 def options_class(name: str) -> type[Any]:
-    """Return the dataclass of a command's options; SettingsError for an unknown command."""
+    """Dataclass of a command's options; SettingsError for an unknown command."""
     check_name(name, COMMANDS, f"expected a command ({', '.join(COMMANDS)})")
     module, found = COMMANDS[name].options.split(".")
     options: type[Any] = getattr(import_module(f".options.{module}", __package__), found)
@@ -137,7 +137,7 @@ def options_class(name: str) -> type[Any]:
 
 
 def parse_command(name: str, words: list[str]) -> Any:
-    """Return the options of a command; SettingsError for bad usage."""
+    """Parse the options of a command; SettingsError for bad usage."""
     options = options_class(name)
     return import_module(".options.parse", __package__).parse(options, f"{PROGRAM} {name}", words)
 

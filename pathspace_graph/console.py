@@ -41,7 +41,7 @@ def verbosity(level: str) -> Iterator[None]:
 
 
 def output(wide: bool = False) -> Console:
-    """Return the console for results; tables are `FILE_WIDTH` wide in a file if `wide`."""
+    """Console for results; tables are `FILE_WIDTH` wide in a file if `wide`."""
     quiet = VERBOSITY.get() == Verbosity.QUIET
     console = _Output(quiet=quiet)
     return _Output(quiet=quiet, width=FILE_WIDTH) if wide and not console.is_terminal else console
@@ -100,7 +100,7 @@ class Steps:
 
 
 def time_remaining(elapsed: float, done: int, total: int) -> str:
-    """Return `elapsed * (total - done) / done` (s) in words."""
+    """`elapsed * (total - done) / done` (s) in words."""
     if not done:
         return "time left unknown"
     return f"{timedelta(seconds=round(elapsed * (total - done) / done))} left"

@@ -1,9 +1,8 @@
 """The exceptions of this library; the command line turns each into one line and exit code 2 or 3."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
-from math import inf
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -37,7 +36,7 @@ class ReadingError(PathspaceError):
         super().__init__(f"{when}{where}: expected {expected}, found {value}")
 
     def at(self, t: float) -> Self:
-        """Return the error with the stamp t (s) of its cycle."""
+        """Add the stamp t (s) of the cycle."""
         return type(self)(self.field, self.expected, self.found, self.row, t)
 
     def __reduce__(self) -> tuple[type[Self], tuple[object, ...]]:
@@ -94,19 +93,3 @@ def check_type(name: str, value: object, kind: type[Any]) -> None:
         found = f"the class {value.__name__}" if isinstance(value, type) else type(value).__name__
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
         raise SettingsError(f"{name}: expected {article} {kind.__name__}, found {found}")
-
-
-NUMBERS: Final[dict[str, Callable[[Any], bool]]] = {  # checks of numbers, by the words of their message
-    "a positive number": lambda value: 0 < value < inf,
-    "a number of at least 0": lambda value: 0 <= value < inf,
-    "a number in [0, 1]": lambda value: 0 <= value <= 1,
-    "a number": lambda value: -inf < value < inf,
-}
-
-
-def check_numbers(settings: object, group: str, names: Iterable[str], expected: str) -> None:
-    """Raise a SettingsError for the first of these settings that fails a check of NUMBERS."""
-    for name in names:
-        value = getattr(settings, name)
-        if not NUMBERS[expected](value):
-            raise SettingsError(f"{group}.{name}: expected {expected}, found {value}")

@@ -43,7 +43,7 @@ def _column(table: Table, name: str, kind: str) -> pd.Series:
 
 
 def run_frame(result: RunResult) -> pd.DataFrame:
-    """Return the cycles of a run as in `read_cycles`, with the pose x, y (m) and theta (rad)."""
+    """Cycles of a run as in `read_cycles`, with the pose x, y (m) and theta (rad)."""
     columns = {name: [getattr(record, name) for record in result.cycles] for name in CYCLE_COLUMNS}
     frame = pd.DataFrame(columns).astype({name: CYCLE_COLUMNS[name] for name in columns}).set_index("cycle")
     return frame.assign(**dict(zip(("x", "y", "theta"), result.trajectory.T, strict=True)))
@@ -74,7 +74,7 @@ def _table(file: Path) -> pd.DataFrame:
 
 
 def to_dataset(study: pd.DataFrame) -> xarray.Dataset:
-    """Return the numbers of a study as a Dataset with the dimensions DIMENSIONS; True becomes 1.
+    """Numbers of a study as a Dataset with the dimensions DIMENSIONS; True becomes 1.
 
     Values of failed and missing runs are NaN. Texts that are equal in all rows, such as versions, become
     attributes. SettingsError if xarray is not installed.

@@ -18,5 +18,5 @@ _CODES: Final = LABELS | {
 
 
 def label_from_name(name: str) -> int:
-    """Return the label of a word, ignoring case and with `-` as `_`; UNKNOWN for any other word."""
+    """Label of a word, ignoring case and with `-` as `_`; UNKNOWN for any other word."""
     return _CODES.get(name.strip().lower().replace("-", "_"), UNKNOWN)

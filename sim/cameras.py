@@ -76,7 +76,7 @@ class DrawnCar:
 
 
 def draw_car(rng: Generator) -> DrawnCar:
-    """Return a car of which everything is drawn, so that nothing can be tuned to one.
+    """Draw everything about a car, so that nothing can be tuned to one.
 
     The distributions are wider than what the few known cars show.
     """
@@ -87,7 +87,7 @@ def draw_car(rng: Generator) -> DrawnCar:
 
 
 def draw_sensor(rng: Generator) -> SensorSettings:
-    """Return a detector of cones."""
+    """Draw a detector of cones."""
     begin = radians(rng.uniform(0.0, 10.0))
     return SensorSettings(
         # front ends run at 10 to 15 Hz; three cameras that share a processor at 5
@@ -125,7 +125,7 @@ def draw_sensor(rng: Generator) -> SensorSettings:
 
 
 def draw_sensor_faults(rng: Generator) -> SensorFaults:
-    """Return constant errors of a detector against the odometry."""
+    """Draw constant errors of a detector against the odometry."""
     yaw = radians(rng.uniform(3.0, 7.0)) if rng.random() < TURNED else radians(rng.uniform(0.0, 1.5))
     return SensorFaults(
         # stamps of the exposure and of the odometry's receipt make early ones, those of the result late ones
@@ -142,7 +142,7 @@ def draw_sensor_faults(rng: Generator) -> SensorFaults:
 
 
 def draw_odometry(rng: Generator) -> OdometryNoise:
-    """Return odometry between a good INS and wheels with a cheap gyro."""
+    """Draw an odometry between a good INS and wheels with a cheap gyro."""
     share = rng.random()
     white = np.array(INS.white) ** (1.0 - share) * np.array(OdometryNoise().white) ** share
     slow = np.array(INS.slow) * rng.uniform(0.5, 1.5)
@@ -157,7 +157,7 @@ def draw_odometry(rng: Generator) -> OdometryNoise:
 
 
 def draw_odometry_faults(rng: Generator) -> OdometryFaults:
-    """Return constant errors of the odometry, and false travel of some."""
+    """Draw constant errors of the odometry, and false travel of some."""
     return OdometryFaults(
         # of a wheel's radius, and of a gyro that was averaged at rest for seconds
         speed_scale=rng.normal(0.0, 0.005),
@@ -169,7 +169,7 @@ def draw_odometry_faults(rng: Generator) -> OdometryFaults:
 
 
 def draw_vehicle(rng: Generator) -> VehicleSettings:
-    """Return how a vehicle drives, which stands still before and after."""
+    """Draw how a vehicle drives, which stands still before and after."""
     return VehicleSettings(
         # a driverless car's first laps have 4 m/s, its best ones 12
         speed_max=rng.uniform(4.0, 12.0),
@@ -182,5 +182,5 @@ def draw_vehicle(rng: Generator) -> VehicleSettings:
 
 
 def log_uniform(rng: Generator, low: float, high: float) -> float:
-    """Return a number whose logarithm is uniform, since its size isn't known."""
+    """Draw a number whose logarithm is uniform, since its size isn't known."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))

@@ -7,47 +7,44 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 import scipy  # which imports its modules when they are used
-from numpy.typing import NDArray
+
+from pathspace_graph.factors.arrays import Array, IntArray
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int_]
-BoolArray = NDArray[np.bool_]
 
-
-def ring(points: FloatArray) -> FloatArray:
-    """Return the points (n, 2) of a closed curve with the first one repeated at the end (n + 1, 2)."""
+def ring(points: Array) -> Array:
+    """Points (n, 2) of a closed curve with the first one repeated at the end (n + 1, 2)."""
     return np.vstack([points, points[:1]])
 
 
-def arc_lengths(points: FloatArray) -> FloatArray:
-    """Return the path length (n,) in m along a polyline (n, 2) from its first point to each."""
+def arc_lengths(points: Array) -> Array:
+    """Path length (n,) in m along a polyline (n, 2) from its first point to each."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
-def along_polyline(at: FloatArray, s: FloatArray, points: FloatArray) -> FloatArray:
+def along_polyline(at: Array, s: Array, points: Array) -> Array:
     """Interpolate a polyline (n, 2) with increasing parameters `s` (n,) at the values `at` (k,): (k, 2)."""
     return np.column_stack([np.interp(at, s, points[:, 0]), np.interp(at, s, points[:, 1])])
 
 
-def unit(vectors: FloatArray) -> FloatArray:
+def unit(vectors: Array) -> Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-def left_normals(tangents: FloatArray) -> FloatArray:
-    """Return the vectors (n, 2) turned a quarter to the left."""
+def left_normals(tangents: Array) -> Array:
+    """Turn vectors (n, 2) by a quarter to the left."""
     return np.stack([-tangents[..., 1], tangents[..., 0]], axis=-1)
 
 
-def direction(theta: float) -> FloatArray:
-    """Return the unit vector (2,) of a heading in rad."""
+def direction(theta: float) -> Array:
+    """Unit vector (2,) of a heading in rad."""
     return np.array([np.cos(theta), np.sin(theta)])
 
 
-def curvature(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the signed curvature (n,) in 1/m, positive to the left, from both derivatives (n, 2)."""
+def curvature(first: Array, second: Array) -> Array:
+    """Signed curvature (n,) in 1/m, positive to the left, from both derivatives (n, 2)."""
     cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     return np.asarray(cross / np.linalg.norm(first, axis=1) ** 3)
 
@@ -67,31 +64,31 @@ class CentreLine:
     spline: CubicSpline  # points (2,) in m by s, which is the arc length to about 0.1 %
     length: float  # length of the curve, or of one lap (m)
     closed: bool
-    clearance: FloatArray  # distance to the nearer row of cones at the spline's knots (k,) in m
+    clearance: Array  # distance to the nearer row of cones at the spline's knots (k,) in m
 
-    def points(self, s: FloatArray) -> FloatArray:
+    def points(self, s: Array) -> Array:
         return np.asarray(self.spline(s))
 
-    def tangents(self, s: FloatArray) -> FloatArray:
+    def tangents(self, s: Array) -> Array:
         return unit(np.asarray(self.spline(s, 1)))
 
-    def curvatures(self, s: FloatArray) -> FloatArray:
+    def curvatures(self, s: Array) -> Array:
         return curvature(np.asarray(self.spline(s, 1)), np.asarray(self.spline(s, 2)))
 
-    def clearances(self, s: FloatArray) -> FloatArray:
+    def clearances(self, s: Array) -> Array:
         period = self.length if self.closed else None
         return np.interp(s, self.spline.x, self.clearance, period=period)
 
-    def nearest(self, pose: FloatArray) -> float:
-        """Return the arc length of the point nearest to a pose (3,) whose tangent leads forward."""
+    def nearest(self, pose: Array) -> float:
+        """Arc length of the point nearest to a pose (3,) whose tangent leads forward."""
         s = np.arange(0.0, self.length, STEP)
         distances = np.linalg.norm(self.points(s) - pose[:2], axis=1)
         ahead = self.tangents(s) @ direction(pose[2])
         return float(s[np.argmin(np.where(ahead > 0, distances, np.inf))])
 
 
-def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> CentreLine:
-    """Return the curve halfway between two rows of cones (n, 2) and (m, 2) in driving order.
+def fit_centre_line(left: Array, right: Array, closed: bool, near: Array) -> CentreLine:
+    """Fit the curve halfway between two rows of cones (n, 2) and (m, 2) in driving order.
 
     The rows are matched from `near` on by the triangulation of least total squared width along both.
     """
@@ -101,7 +98,7 @@ def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: Flo
     curve = _smooth(curve, closed)
     index = rungs[np.rint(rung_of).astype(int) % len(rungs)].T
 
-    def distances(curve: FloatArray) -> list[FloatArray]:
+    def distances(curve: Array) -> list[Array]:
         return [_row_distances(curve, row, k, closed) for row, k in zip((left, right), index, strict=True)]
 
     for _ in range(CENTRINGS):
@@ -110,14 +107,14 @@ def fit_centre_line(left: FloatArray, right: FloatArray, closed: bool, near: Flo
     return _as_spline(curve, np.minimum(*distances(curve)), closed)
 
 
-def along_path(points: FloatArray, cones: FloatArray, closed: bool) -> CentreLine:
-    """Return the smooth curve along points (k, 2), whose clearance is the distance to the nearest cone."""
+def along_path(points: Array, cones: Array, closed: bool) -> CentreLine:
+    """Fit a smooth curve along points (k, 2), whose clearance is the distance to the nearest cone."""
     curve = _smooth(resample(points, STEP, closed)[0], closed)
     return _as_spline(curve, np.asarray(scipy.spatial.KDTree(cones).query(curve)[0]), closed)
 
 
-def match_rows(left: FloatArray, right: FloatArray, closed: bool, near: FloatArray) -> IntArray:
-    """Return index pairs (k, 2) into both rows, each step advancing one, of least total squared distance."""
+def match_rows(left: Array, right: Array, closed: bool, near: Array) -> IntArray:
+    """Match rows by index pairs (k, 2), each step advancing one, of least total squared distance."""
     if not closed:
         return _match(left, right)[1]
     best_cost, best = np.inf, np.zeros((0, 2), dtype=int)
@@ -131,7 +128,7 @@ def match_rows(left: FloatArray, right: FloatArray, closed: bool, near: FloatArr
     return best
 
 
-def _match(left: FloatArray, right: FloatArray) -> tuple[float, IntArray]:
+def _match(left: Array, right: Array) -> tuple[float, IntArray]:
     width = np.sum((left[:, None] - right[None]) ** 2, axis=-1)
     total = np.empty_like(width)
     total[0] = np.cumsum(width[0])
@@ -149,8 +146,8 @@ def _match(left: FloatArray, right: FloatArray) -> tuple[float, IntArray]:
     return float(total[-1, -1]), np.array(pairs[::-1])
 
 
-def resample(points: FloatArray, step: float, closed: bool) -> tuple[FloatArray, FloatArray]:
-    """Return points (n, 2) about `step` apart along a polyline, and their fractional indices in it (n,)."""
+def resample(points: Array, step: float, closed: bool) -> tuple[Array, Array]:
+    """Points (n, 2) about `step` apart along a polyline, and their fractional indices in it (n,)."""
     polyline = ring(points) if closed else points
     s = arc_lengths(polyline)
     count = max(int(np.ceil(s[-1] / step)), 2)
@@ -158,7 +155,7 @@ def resample(points: FloatArray, step: float, closed: bool) -> tuple[FloatArray,
     return along_polyline(at, s, polyline), np.interp(at, s, np.arange(len(polyline), dtype=float))
 
 
-def _smooth(curve: FloatArray, closed: bool) -> FloatArray:
+def _smooth(curve: Array, closed: bool) -> Array:
     sigma = SMOOTHING / STEP
     if closed:
         return np.asarray(scipy.ndimage.gaussian_filter1d(curve, sigma, axis=0, mode="wrap"))
@@ -167,13 +164,13 @@ def _smooth(curve: FloatArray, closed: bool) -> FloatArray:
     return np.asarray(scipy.ndimage.gaussian_filter1d(padded, sigma, axis=0)[pad:-pad])
 
 
-def _normals(curve: FloatArray, closed: bool) -> FloatArray:
+def _normals(curve: Array, closed: bool) -> Array:
     along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
     return left_normals(unit(along if closed else np.gradient(curve, axis=0)))
 
 
-def _row_distances(curve: FloatArray, row: FloatArray, index: IntArray, closed: bool) -> FloatArray:
-    """Return the distance of each sample to the row's segments near its matched cone `index` (n,)."""
+def _row_distances(curve: Array, row: Array, index: IntArray, closed: bool) -> Array:
+    """Distance of each sample to the row's segments near its matched cone `index` (n,)."""
     segments = index[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS)
     mode: Literal["wrap", "clip"] = "wrap" if closed else "clip"
     a, b = (row.take(ends, axis=0, mode=mode) for ends in (segments, segments + 1))
@@ -183,7 +180,7 @@ def _row_distances(curve: FloatArray, row: FloatArray, index: IntArray, closed: 
     return np.asarray(np.linalg.norm(a + part[..., None] * along - curve[:, None], axis=-1).min(axis=1))
 
 
-def _as_spline(curve: FloatArray, clearance: FloatArray, closed: bool) -> CentreLine:
+def _as_spline(curve: Array, clearance: Array, closed: bool) -> CentreLine:
     knots, index = resample(curve, KNOT_STEP, closed)
     at_knots = np.interp(index, np.arange(len(curve)), clearance)
     if closed:

@@ -8,7 +8,9 @@ from typing import Final
 import numpy as np
 import scipy  # which imports its modules when they are used
 
-from .curves import FloatArray, IntArray, direction, left_normals, ring
+from pathspace_graph.factors.arrays import Array, IntArray
+
+from .curves import direction, left_normals, ring
 
 RUNG_MAX: Final = 12.0  # largest distance of a left and a right cone of one lane (m)
 GATE_REACH: Final = 12.0  # from the start, within which gate cones stand in for missing ones (m)
@@ -27,9 +29,7 @@ class DrivingOrder:
     closed: bool
 
 
-def driving_order(
-    left: FloatArray, right: FloatArray, gate: FloatArray, start: FloatArray
-) -> DrivingOrder | None:
+def driving_order(left: Array, right: Array, gate: Array, start: Array) -> DrivingOrder | None:
     """Order cones (n, 2), (m, 2) of both boundaries along the lane that the start [x, y, theta] stands in.
 
     The lane is the Delaunay triangles that join both boundaries, each of which shares a rung with the next.
@@ -42,7 +42,7 @@ def driving_order(
     return without_gate if order is None or (without_gate is not None and without_gate.closed) else order
 
 
-def _order(left: FloatArray, right: FloatArray, gate: FloatArray, start: FloatArray) -> DrivingOrder | None:
+def _order(left: Array, right: Array, gate: Array, start: Array) -> DrivingOrder | None:
     step = gate - start[:2]
     near, side = np.linalg.norm(step, axis=1) < GATE_REACH, step @ left_normals(direction(start[2]))
     gate_left, gate_right = gate[near & (side > 0)], gate[near & (side <= 0)]
@@ -60,7 +60,7 @@ def _order(left: FloatArray, right: FloatArray, gate: FloatArray, start: FloatAr
     return DrivingOrder(lefts, rights, closed)
 
 
-def _apexes(points: FloatArray) -> Apexes:
+def _apexes(points: Array) -> Apexes:
     apexes: dict[Rung, list[int]] = defaultdict(list)
     try:
         triangles = scipy.spatial.Delaunay(points).simplices.tolist()
@@ -73,8 +73,8 @@ def _apexes(points: FloatArray) -> Apexes:
     return apexes
 
 
-def _first_rung(points: FloatArray, split: int, apexes: Apexes, start: FloatArray) -> Rung | None:
-    """Return the nearest rung across the start's heading, its left cone on the left."""
+def _first_rung(points: Array, split: int, apexes: Apexes, start: Array) -> Rung | None:
+    """Nearest rung across the start's heading, its left cone on the left."""
     rungs = np.array([edge for edge in apexes if edge[0] < split <= edge[1]], dtype=int).reshape(-1, 2)
     step, heading = points[rungs] - start[:2], direction(start[2])
     along, across = step @ heading, step @ left_normals(heading)
@@ -88,9 +88,7 @@ def _first_rung(points: FloatArray, split: int, apexes: Apexes, start: FloatArra
     return int(i), int(j)
 
 
-def _walk(
-    points: FloatArray, split: int, apexes: Apexes, first: Rung, forward: bool
-) -> tuple[list[Rung], bool]:
+def _walk(points: Array, split: int, apexes: Apexes, first: Rung, forward: bool) -> tuple[list[Rung], bool]:
     rungs = {first: None}  # in order, without repeats
     i, j = first
     while (apex := _next_apex(points, apexes[i, j], (i, j), forward)) is not None:
@@ -101,7 +99,7 @@ def _walk(
     return list(rungs), False
 
 
-def _next_apex(points: FloatArray, apexes: Sequence[int], rung: Rung, forward: bool) -> int | None:
+def _next_apex(points: Array, apexes: Sequence[int], rung: Rung, forward: bool) -> int | None:
     left, right = points[rung[0]], points[rung[1]]
     a = left - right
     for apex in apexes:
@@ -111,8 +109,8 @@ def _next_apex(points: FloatArray, apexes: Sequence[int], rung: Rung, forward: b
     return None
 
 
-def _row(cones: FloatArray, walked: list[int], closed: bool) -> IntArray:
-    """Return the cones walked, in order and once each, with missed ones inserted where they fit."""
+def _row(cones: Array, walked: list[int], closed: bool) -> IntArray:
+    """Order the walked cones, each once, and insert missed ones where they fit."""
     row = list(dict.fromkeys(walked))
     for missed in sorted(set(range(len(cones))) - set(row)):
         if len(row) < 2:

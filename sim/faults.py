@@ -1,106 +1,96 @@
 """The faults of a real car that white noise does not have, off by default, and what they do to a drive."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from pathspace_graph.errors import SettingsError, check_numbers
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.settings.checked import AtLeast0, Checked, Share, Signed
 
-from .curves import FloatArray, IntArray, arc_lengths
+from .curves import arc_lengths
 from .sensor import OdometryNoise, measure_twists
 from .track import Track
 from .vehicle import Drive
 
 
 @dataclass(frozen=True)
-class SensorFaults:
+class SensorFaults(Checked, group="faults.sensor"):
     """A cone detector that is late, badly mounted, badly scaled, colour-blind or out of order."""
 
-    latency: float = 0.0
+    latency: Signed = 0.0
     """Age of the detections at their stamps (s), negative where they are newer."""
-    yaw: float = 0.0
+    yaw: Signed = 0.0
     """Turn of the sensor to the left that its detections don't account for (rad)."""
-    lateral: float = 0.0
+    lateral: Signed = 0.0
     """Offset of the sensor to the left of where its detections assume it (m)."""
-    range_scale: float = 0.0
+    range_scale: Signed = 0.0
     """Share by which each range is too long (-)."""
-    range_bias: float = 0.0
+    range_bias: Signed = 0.0
     """Length by which each range is too long (m)."""
-    colourless: float = 0.0
+    colourless: Share = 0.0
     """Share of the detections without a colour, drawn one by one."""
-    dropout: float = 0.0
+    dropout: AtLeast0 = 0.0
     """Time for which nothing is detected (s)."""
-    dropout_at: float = 0.5
+    dropout_at: AtLeast0 = 0.5
     """Laps after which the dropout begins."""
-    blind: float = 0.0
+    blind: AtLeast0 = 0.0
     """Length of the stretch on which the cones of one side aren't detected (m)."""
-    blind_at: float = 0.5
+    blind_at: AtLeast0 = 0.5
     """Laps after which that stretch begins."""
     blind_side: Literal["left", "right"] = "left"
     """Side whose cones aren't detected there."""
 
     def __post_init__(self) -> None:
-        at_least_0 = ("dropout", "dropout_at", "blind", "blind_at")
-        check_numbers(self, "faults.sensor", at_least_0, "a number of at least 0")
-        check_numbers(self, "faults.sensor", ("colourless",), "a number in [0, 1]")
-        check_numbers(self, "faults.sensor", ("latency", "yaw", "lateral", "range_bias"), "a number")
-        if not -1.0 < self.range_scale < np.inf:
+        super().__post_init__()
+        if self.range_scale <= -1.0:
             raise SettingsError(f"faults.sensor.range_scale: expected more than -1, found {self.range_scale}")
 
 
 @dataclass(frozen=True)
-class OdometryFaults:
+class OdometryFaults(Checked, group="faults.odometry"):
     """Odometry with a biased yaw rate, slipping wheels, or readings that fail."""
 
-    yaw_rate_bias: float = 0.0
+    yaw_rate_bias: Signed = 0.0
     """Bias of the yaw rate beside the drawn one (rad/s)."""
-    speed_scale: float = field(default=0.0, repr=False)
+    speed_scale: Signed = 0.0
     """Share by which the speeds are too large, beside the drawn scale (-)."""
-    slip: float = 0.0
+    slip: Signed = 0.0
     """Share by which the speeds are too large while the wheels slip (-)."""
-    slip_time: float = 1.0
+    slip_time: AtLeast0 = 1.0
     """Time for which the wheels slip (s)."""
     slip_every: float = 8.0
     """Time from one slip to the next, and to the first (s)."""
-    zero: float = 0.0
+    zero: AtLeast0 = 0.0
     """Time for which the measured twists are zero (s)."""
-    zero_at: float = 0.5
+    zero_at: AtLeast0 = 0.5
     """Laps after which the zeros begin."""
-    gap: float = 0.0
+    gap: AtLeast0 = 0.0
     """Time without a measured twist, so that the last one before is held (s)."""
-    gap_at: float = 0.5
+    gap_at: AtLeast0 = 0.5
     """Laps after which the gap begins."""
-    false_travel: float = field(default=0.0, repr=False)
+    false_travel: AtLeast0 = 0.0
     """Speed (m/s) below which the odometry doesn't fall while the vehicle brakes to its last stand."""
-    false_travel_time: float = field(default=3.0, repr=False)
-    """Time for which it goes on so while the vehicle stands (s)."""
-
-    def __post_init__(self) -> None:
-        at_least_0 = ("slip_time", "zero", "zero_at", "gap", "gap_at", "false_travel", "false_travel_time")
-        check_numbers(self, "faults.odometry", at_least_0, "a number of at least 0")
-        check_numbers(self, "faults.odometry", ("slip_every",), "a positive number")
-        check_numbers(self, "faults.odometry", ("yaw_rate_bias", "speed_scale", "slip"), "a number")
+    false_travel_time: AtLeast0 = 3.0
+    """Time for which this continues while the vehicle stands (s)."""
 
 
 @dataclass(frozen=True)
-class VehicleFaults:
+class VehicleFaults(Checked, group="faults.vehicle"):
     """A vehicle that is put down elsewhere, or that drives the other way round."""
 
-    put_down: float = 0.0
+    put_down: AtLeast0 = 0.0
     """Distance along the track by which the vehicle is carried, unknown to the odometry (m)."""
-    put_down_at: float = 1.5
+    put_down_at: AtLeast0 = 1.5
     """Laps after which the vehicle is carried."""
     wrong_way: bool = False
     """Whether a closed track is driven the other way round, so that the blue cones are on the right. The
-    truth calls the boundary on the left of the way driven the left one."""
-
-    def __post_init__(self) -> None:
-        check_numbers(self, "faults.vehicle", ("put_down", "put_down_at"), "a number of at least 0")
+    left boundary of the truth is the one on the left of the vehicle."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +113,7 @@ def _is_during(driven: Drive, distance: float, time: float) -> NDArray[np.bool_]
 
 
 def turned_round(track: Track) -> Track:
-    """Return a closed track as it is when it is driven the other way round: what was left is right."""
+    """Reverse the direction of a closed track, whose left cones are right ones then."""
     if not track.closed:
         raise SettingsError("faults.vehicle.wrong_way: expected a closed track, found an open one")
     start = track.start + np.array([0.0, 0.0, np.pi])
@@ -131,7 +121,7 @@ def turned_round(track: Track) -> Track:
 
 
 def put_down(driven: Drive, lap: float, faults: VehicleFaults) -> Drive:
-    """Return the drive without the stretch that the vehicle is carried over; a lap is `lap` m long."""
+    """Remove the stretch over which the vehicle is carried; a lap is `lap` m long."""
     if not faults.put_down:
         return driven
     s = arc_lengths(driven.poses[:, :2])
@@ -143,8 +133,8 @@ def put_down(driven: Drive, lap: float, faults: VehicleFaults) -> Drive:
 
 def measure_odometry(
     driven: Drive, lap: float, noise: OdometryNoise, faults: OdometryFaults, rng: Generator
-) -> tuple[Odometry, FloatArray]:
-    """Return the measured twists, and the scale error (-) and the bias (rad/s) that they have (2,)."""
+) -> tuple[Odometry, Array]:
+    """Measure the twists; also return their scale error (-) and bias (rad/s) (2,)."""
     dt = float(driven.t[:2][-1])
     wheels = _wheel_twists(driven, faults)
     measured, calibration = measure_twists(wheels, dt, noise, rng)
@@ -157,8 +147,8 @@ def measure_odometry(
     return Odometry(driven.t[kept], measured[kept]), calibration + constant
 
 
-def _wheel_twists(driven: Drive, faults: OdometryFaults) -> FloatArray:
-    """Return the twists (N, 3) of the body, except where the wheels slip or report false travel."""
+def _wheel_twists(driven: Drive, faults: OdometryFaults) -> Array:
+    """Twists (N, 3) of the body, except where the wheels slip or report false travel."""
     twists = driven.twists.copy()
     if faults.slip:
         since = driven.t % faults.slip_every
@@ -174,7 +164,7 @@ def _wheel_twists(driven: Drive, faults: OdometryFaults) -> FloatArray:
 
 
 def colours(track: Track, wrong_way: bool) -> IntArray:
-    """Return the label that the colour of each cone stands for (M,), the other side's if driven backwards."""
+    """Labels (M,) that the cones' colours stand for; the other side's if driven the wrong way."""
     labels = track.cone_labels
     changed = wrong_way & np.isin(labels, BOUNDARIES)
     return np.where(changed, LEFT + RIGHT - labels, labels)

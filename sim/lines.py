@@ -1,19 +1,21 @@
-"""A sensor of lines, kerbs or walls: points of both boundaries, at other places in each cycle."""
+"""A sensor of lines, kerbs or walls: points of both boundaries, at different places in each cycle."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import numpy as np
 import scipy  # which imports its modules when they are used
 from numpy.random import Generator
 
-from pathspace_graph.errors import SettingsError, check_numbers
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.settings.checked import AT_LEAST_0, AtLeast0, Checked
 
-from .curves import STEP, FloatArray, IntArray, arc_lengths, direction, left_normals, ring, unit
+from .curves import STEP, arc_lengths, direction, left_normals, ring, unit
 from .sensor import SensorSettings, false_positives, polar_detections, seen_from
 from .track import Track
 
@@ -24,21 +26,17 @@ TRUE_SPACING: Final = 1.0  # greatest distance of the points of a true boundary 
 
 
 @dataclass(frozen=True)
-class LineSettings:
+class LineSettings(Checked, group="line"):
     """Which points of the boundaries a sensor of lines sees."""
 
-    spacing: float = field(default=0.0, repr=False)
+    spacing: AtLeast0 = 0.0
     """Mean distance of a cycle's points along each boundary (m); with 0 the sensor detects cones instead."""
-    sigma_across: float = field(default=0.0, repr=False)
+    sigma_across: AtLeast0 = 0.0
     """Standard deviation of a point across its boundary beside the noise of range and bearing (m)."""
-    gaps: int = field(default=0, repr=False)
+    gaps: Annotated[int, AT_LEAST_0] = 0
     """Number of stretches of a boundary in which nothing is detected, drawn once for a log."""
-    gap_length: float = field(default=10.0, repr=False)
+    gap_length: AtLeast0 = 10.0
     """Length of each of them (m)."""
-
-    def __post_init__(self) -> None:
-        names = ("spacing", "sigma_across", "gaps", "gap_length")
-        check_numbers(self, "line", names, "a number of at least 0")
 
 
 LINE: Final = SensorSettings(
@@ -54,25 +52,25 @@ LINE: Final = SensorSettings(
 class BoundaryCurve:
     """The smooth curve through the points (n, 2) of a boundary in driving order, by its arc length."""
 
-    def __init__(self, points: FloatArray, closed: bool) -> None:
+    def __init__(self, points: Array, closed: bool) -> None:
         by_chord = _through(points, closed)
         s = np.linspace(0.0, by_chord.x[-1], int(np.ceil(by_chord.x[-1] / STEP)) + 1)
         self._spline = _through(np.asarray(by_chord(s))[: len(s) - closed], closed)
         self._closed = closed
         self.length = float(self._spline.x[-1])
 
-    def points(self, s: FloatArray) -> FloatArray:
+    def points(self, s: Array) -> Array:
         return np.asarray(self._spline(s))
 
-    def normals(self, s: FloatArray) -> FloatArray:
+    def normals(self, s: Array) -> Array:
         return left_normals(unit(np.asarray(self._spline(s, 1))))
 
-    def beyond(self, s: FloatArray, begin: float) -> FloatArray:
-        """Return how far (m,) places `s` lie beyond `begin`, round a closed curve; negative before it."""
+    def beyond(self, s: Array, begin: float) -> Array:
+        """Distances (m,) of places `s` beyond `begin`, round a closed curve; negative before it."""
         return (s - begin) % self.length if self._closed else s - begin
 
 
-def _through(points: FloatArray, closed: bool) -> CubicSpline:
+def _through(points: Array, closed: bool) -> CubicSpline:
     points = ring(points) if closed else points
     s = arc_lengths(points)
     new = np.diff(s, prepend=-1.0) > 0.0
@@ -81,21 +79,21 @@ def _through(points: FloatArray, closed: bool) -> CubicSpline:
 
 
 def as_lines(track: Track) -> Track:
-    """Return a track whose cones are points of its boundaries, each the smooth curve through the cones."""
+    """Replace the cones of a track by points of smooth curves through them."""
     if track.path is not None:
         raise SettingsError(f"line.spacing: expected a track between two boundaries, found the {track.name}")
     left, right = (_true_points(row, track.closed) for row in (track.left, track.right))
     return replace(track, left=left, right=right, other=np.zeros((0, 2)), other_labels=None)
 
 
-def _true_points(cones: FloatArray, closed: bool) -> FloatArray:
+def _true_points(cones: Array, closed: bool) -> Array:
     curve = BoundaryCurve(cones, closed)
     count = int(np.ceil(curve.length / TRUE_SPACING))
     return curve.points(np.linspace(0.0, curve.length, count + 1)[: count + (not closed)])
 
 
 class LineSensor:
-    """Points anywhere along both boundaries, drawn anew in each cycle, so that none is met twice.
+    """Points anywhere along both boundaries, drawn independently in each cycle.
 
     A covariance is that of the noise of range and bearing, and of the scatter across the boundary: the
     variance of the distance across is exact. Along the boundary a point lies anywhere, and the covariance
@@ -115,9 +113,9 @@ class LineSensor:
         """Boundary of each gap, and the place along it where the gap begins (m)."""
 
     def detect(
-        self, t: float, pose: FloatArray, scale: float = 0.0, bias: float = 0.0
+        self, t: float, pose: Array, scale: float = 0.0, bias: float = 0.0
     ) -> tuple[Detections, IntArray]:
-        """Return a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
+        """Detect a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
 
         The second result is the point of the true boundary nearest to each detection (m,).
         """
@@ -133,9 +131,9 @@ class LineSensor:
         return found.where(kept), index[kept]
 
     def _detect_lines(
-        self, pose: FloatArray, scale: float, bias: float
-    ) -> tuple[FloatArray, FloatArray, IntArray, IntArray, FloatArray]:
-        """Return measured ranges and bearings, labels, nearest true points and normals (m, 2)."""
+        self, pose: Array, scale: float, bias: float
+    ) -> tuple[Array, Array, IntArray, IntArray, Array]:
+        """Measured ranges and bearings, labels, nearest true points and normals (m, 2)."""
         settings, rng = self._settings, self._noise_rng
         points, normals, nearest = self._draw()
         chance, colour = rng.random((2, len(points)))
@@ -150,7 +148,7 @@ class LineSensor:
         labels = np.where(colour < settings.wrong_colour, LEFT + RIGHT - labels, labels)
         return ranges[seen], bearings[seen], labels[seen], nearest[seen], normals[seen]
 
-    def _draw(self) -> tuple[FloatArray, FloatArray, IntArray]:
+    def _draw(self) -> tuple[Array, Array, IntArray]:
         """Draw points (m, 2) of both boundaries, with their normals and the nearest true points (m,)."""
         drawn = []
         for side, curve in enumerate(self._curves):
@@ -166,7 +164,7 @@ class LineSensor:
         return points, normals, index
 
 
-def _to_vehicle(theta: float) -> FloatArray:
-    """Return the matrix (2, 2) by which rows of vectors in the map frame turn into the vehicle's."""
+def _to_vehicle(theta: float) -> Array:
+    """Matrix (2, 2) by which rows of vectors in the map frame turn into the vehicle's."""
     ahead = direction(theta)
     return np.column_stack([ahead, left_normals(ahead)])

@@ -11,10 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT
 
-from .curves import FloatArray
 from .vehicle import integrate
 
 Mistake = Callable[[Log], Log]
@@ -26,19 +26,19 @@ def with_cycles(log: Log, change: Callable[[Detections], dict[str, Any]]) -> Log
     return replace(log, cycles=tuple(replace(cycle, **change(cycle)) for cycle in log.cycles))
 
 
-def with_points(log: Log, change: Callable[[FloatArray], FloatArray]) -> Log:
+def with_points(log: Log, change: Callable[[Array], Array]) -> Log:
     return with_cycles(log, lambda cycle: {"points_vehicle": change(cycle.points_vehicle)})
 
 
-def with_covariances(log: Log, change: Callable[[FloatArray], FloatArray]) -> Log:
+def with_covariances(log: Log, change: Callable[[Array], Array]) -> Log:
     return with_cycles(log, lambda cycle: {"covariances": change(cycle.covariances)})
 
 
-def with_twists(log: Log, factors: FloatArray | tuple[float, float, float]) -> Log:
+def with_twists(log: Log, factors: Array | tuple[float, float, float]) -> Log:
     return with_twists_of(log, log.odometry.twist * factors)
 
 
-def with_twists_of(log: Log, twist: FloatArray) -> Log:
+def with_twists_of(log: Log, twist: Array) -> Log:
     return replace(log, odometry=replace(log.odometry, twist=twist))
 
 
@@ -47,20 +47,20 @@ def with_stamps(log: Log, odometry: float = 1.0, detections: float = 1.0) -> Log
     return replace(log, odometry=replace(log.odometry, t=log.odometry.t * odometry))
 
 
-def turned(log: Log, to_vehicle: FloatArray) -> Log:
-    """Return the log with detections in a frame that a matrix (2, 2) takes to the vehicle's."""
+def turned(log: Log, to_vehicle: Array) -> Log:
+    """Move detections to a frame that a matrix (2, 2) takes to the vehicle's."""
     log = with_covariances(log, lambda covariances: to_vehicle.T @ covariances @ to_vehicle)
     return with_points(log, lambda points: points @ to_vehicle)
 
 
 def in_frame(log: Log, turn: float = 0.0, ahead: float = 0.0, left: float = 0.0) -> Log:
-    """Return the log with detections in the frame of a sensor: turned to the left (rad), and placed (m)."""
+    """Move detections to the frame of a sensor: turned to the left (rad), and placed (m)."""
     c, s = np.cos(turn), np.sin(turn)
     return turned(with_points(log, lambda points: points - [ahead, left]), np.array([[c, -s], [s, c]]))
 
 
 def camera(log: Log, height: float = 0.6, sigma: float = 0.02) -> Log:
-    """Return the log with x to the right and y down of a camera at a height (m); z ahead is lost."""
+    """Use x to the right and y down of a camera at a height (m); z ahead is lost."""
     rng = np.random.default_rng(0)
     return with_points(
         log, lambda points: np.column_stack([-points[:, 1], rng.normal(height, sigma, len(points))])
@@ -68,17 +68,17 @@ def camera(log: Log, height: float = 0.6, sigma: float = 0.02) -> Log:
 
 
 def bearings_as_degrees(log: Log) -> Log:
-    """Return the log with detections made of bearings in degrees that were taken for radians."""
+    """Take bearings in degrees for radians."""
 
-    def wrong(points: FloatArray) -> FloatArray:
+    def wrong(points: Array) -> Array:
         ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0]) / DEGREE
         return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
 
     return with_points(log, wrong)
 
 
-def dead_reckoned(log: Log) -> FloatArray:
-    """Return poses (N, 3) at the odometry's stamps, by the odometry alone."""
+def dead_reckoned(log: Log) -> Array:
+    """Poses (N, 3) at the odometry's stamps, by the odometry alone."""
     return integrate(log.odometry.twist[:-1], np.diff(log.odometry.t))
 
 
@@ -100,7 +100,7 @@ def detections_in_the_map(log: Log) -> Log:
 
 
 def late(log: Log, seconds: float) -> Log:
-    """Return the log with detections that are stamped too late (s); those after its end are left out."""
+    """Stamp detections too late (s); those after the end are dropped."""
     first, last = log.odometry.t[[0, -1]]
     log = with_cycles(log, lambda cycle: {"t": cycle.t + seconds})
     truth = None if log.truth is None else replace(log.truth, associations=None)
@@ -108,7 +108,7 @@ def late(log: Log, seconds: float) -> Log:
 
 
 def in_millimetres(log: Log) -> Log:
-    """Return the log with all lengths in mm: positions, covariances and speeds."""
+    """State all lengths in mm: positions, covariances and speeds."""
     log = with_covariances(with_points(log, lambda points: 1e3 * points), lambda K: 1e6 * K)
     return with_twists(log, (1e3, 1e3, 1.0))
 

@@ -1,47 +1,40 @@
 """The vehicle's sensors: noisy odometry, and a detector of cones."""
 
-from dataclasses import dataclass, field
-from typing import Final
+from dataclasses import dataclass
+from typing import Annotated, Final
 
 import numpy as np
 import scipy  # which imports its modules when they are used
 from numpy.random import Generator
 
-from pathspace_graph.errors import SettingsError, check_numbers
-from pathspace_graph.io.log import Detections, polar_covariances
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.io.covariances import polar_covariances
+from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-
-from .curves import BoolArray, FloatArray, IntArray
+from pathspace_graph.settings.checked import AT_LEAST_0, POSITIVE, AtLeast0, Checked, Share, Signed
 
 FALSE_POSITIVE: Final = -1  # association of a detection that is of no cone
 CAMERAS: Final = 2  # cameras that may see a cone at once
 
 
 @dataclass(frozen=True)
-class OdometryNoise:
+class OdometryNoise(Checked, group="odometry"):
     """Errors of the measured twist."""
 
-    white: tuple[float, float, float] = (0.25, 0.12, 0.035)
+    white: Annotated[tuple[float, float, float], POSITIVE] = (0.25, 0.12, 0.035)
     """Standard deviations of [vx, vy, wz], white from sample to sample (m/s, m/s, rad/s)."""
-    scale: float = 0.004
+    scale: AtLeast0 = 0.004
     """Standard deviation of the scale error of vx and vy, drawn once for a log (-)."""
-    gyro_bias: float = 0.0015
+    gyro_bias: AtLeast0 = 0.0015
     """Standard deviation of the bias of wz, drawn once for a log (rad/s)."""
-    slow: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), repr=False)
+    slow: Annotated[tuple[float, float, float], AT_LEAST_0] = (0.0, 0.0, 0.0)
     """Standard deviations of the slow errors of [vx, vy, wz] beside the white noise (m/s, m/s, rad/s)."""
-    slow_time: float = field(default=5.0, repr=False)
+    slow_time: float = 5.0
     """Correlation time of the slow errors (s)."""
 
-    def __post_init__(self) -> None:
-        if len(self.white) != 3 or not all(0 < sigma < np.inf for sigma in self.white):
-            raise SettingsError(f"odometry.white: expected three positive numbers, found {self.white}")
-        if len(self.slow) != 3 or not all(0 <= sigma < np.inf for sigma in self.slow):
-            raise SettingsError(f"odometry.slow: expected three numbers of at least 0, found {self.slow}")
-        check_numbers(self, "odometry", ("scale", "gyro_bias"), "a number of at least 0")
-        check_numbers(self, "odometry", ("slow_time",), "a positive number")
-
-    def drift_sigmas(self, dt: float) -> FloatArray:
-        """Return the standard deviations (3,) of white noise that drifts as much, `dt` s apart.
+    def drift_sigmas(self, dt: float) -> Array:
+        """Standard deviations (3,) of white noise that drifts as much, `dt` s apart.
 
         The spectrum at frequency 0: `white^2 + slow^2 (1 + rho) / (1 - rho)`, `rho = exp(-dt / slow_time)`.
         """
@@ -50,32 +43,32 @@ class OdometryNoise:
 
 
 @dataclass(frozen=True)
-class SensorSettings:
+class SensorSettings(Checked):
     """What the sensor sees, and its errors."""
 
     rate: float = 10.0
     """Perception cycles per second (Hz)."""
     range_max: float = 15.0
     """Greatest true range of a detection (m)."""
-    range_min: float = 0.5
+    range_min: AtLeast0 = 0.5
     """Least true range of a detection (m)."""
     fov: float = float(np.deg2rad(110.0))
     """Field of view, the whole angle (rad)."""
     range_sigma: float = 0.05
     """Standard deviation of the range at range 0 (m)."""
-    range_sigma_growth: float = 0.012
+    range_sigma_growth: AtLeast0 = 0.012
     """Growth of that standard deviation with the range (m/m)."""
     bearing_sigma: float = float(np.deg2rad(0.9))
     """Standard deviation of the bearing (rad)."""
-    detection_probability: float = 0.98
+    detection_probability: Share = 0.98
     """Probability that a cone in the field of view is detected at range 0."""
-    detection_falloff: float = 0.01
+    detection_falloff: AtLeast0 = 0.01
     """Decrease of the probability of detection with the range (1/m)."""
-    blind_fraction: float = 0.05
+    blind_fraction: Share = 0.05
     """Share of the cones that are never detected, drawn once for a log."""
-    wrong_colour: float = 0.01
+    wrong_colour: Share = 0.01
     """Probability that a detected boundary cone has the other boundary's label."""
-    false_positives: float = 0.03
+    false_positives: AtLeast0 = 0.03
     """Expected number of detections of nothing in a cycle."""
     range_bias: bool = False
     """Whether ranges have a systematic error, as those of cameras do."""
@@ -83,38 +76,31 @@ class SensorSettings:
     """Increasing ranges of the given systematic errors (m), which are linear between them."""
     range_bias_values: tuple[float, ...] = (0.02, 0.34)
     """Systematic errors at those ranges (m), typical of cameras."""
-    range_bend: float = field(default=0.0, repr=False)
+    range_bend: Signed = 0.0
     """Bend k of the ranges (1/m): a range r reads `k (r - range_bend_from)^2` longer beyond that range."""
-    range_bend_from: float = field(default=9.0, repr=False)
+    range_bend_from: AtLeast0 = 9.0
     """Range from which on ranges bend (m)."""
-    slow_range: float = field(default=0.0, repr=False)
+    slow_range: Share = 0.0
     """Share of a range's variance in the slow error of its cone (-)."""
-    slow_bearing: float = field(default=0.0, repr=False)
+    slow_bearing: Share = 0.0
     """Share of a bearing's variance in the slow error of its cone (-)."""
-    slow_time: float = field(default=5.0, repr=False)
+    slow_time: float = 5.0
     """Correlation time of the slow errors of a cone (s)."""
-    duplicates: float = field(default=0.0, repr=False)
+    duplicates: Share = 0.0
     """Probability that a second camera detects a detected cone of the overlap too, with its own errors."""
-    overlap: tuple[float, float] = field(default=(0.0, float(np.pi)), repr=False)
+    overlap: tuple[float, float] = (0.0, float(np.pi))
     """Least and greatest bearing of the overlap, on both sides (rad)."""
-    dropped_cycles: float = field(default=0.0, repr=False)
+    dropped_cycles: Share = 0.0
     """Share of the cycles in which nothing is detected."""
 
     def __post_init__(self) -> None:
-        positive = ("rate", "range_max", "bearing_sigma", "range_sigma", "fov", "slow_time")
-        check_numbers(self, "sensor", positive, "a positive number")
-        at_least_0 = ("range_min", "range_sigma_growth", "detection_falloff", "false_positives")
-        check_numbers(self, "sensor", at_least_0, "a number of at least 0")
+        super().__post_init__()
         if self.fov > 2 * np.pi or self.range_min >= self.range_max:
             raise SettingsError("sensor: expected fov <= 2 pi rad and range_min < range_max")
-        check_numbers(self, "sensor", ("range_bend",), "a number")
-        check_numbers(self, "sensor", ("range_bend_from",), "a number of at least 0")
         if 1.0 + 2.0 * self.range_bend * max(self.range_max - self.range_bend_from, 0.0) <= 0.0:
             raise SettingsError(
                 f"sensor.range_bend: expected farther cones to read farther, found {self.range_bend}"
             )
-        shares = ("detection_probability", "blind_fraction", "wrong_colour", "duplicates", "dropped_cycles")
-        check_numbers(self, "sensor", (*shares, "slow_range", "slow_bearing"), "a number in [0, 1]")
         least, greatest = self.overlap
         if not 0.0 <= least < greatest:
             raise SettingsError(f"sensor.overlap: expected 0 <= least < greatest, found {self.overlap}")
@@ -123,29 +109,27 @@ class SensorSettings:
             expected = "expected increasing ranges, one for each of range_bias_values"
             raise SettingsError(f"sensor.range_bias_at: {expected}")
 
-    def range_sigmas(self, ranges: FloatArray) -> FloatArray:
+    def range_sigmas(self, ranges: Array) -> Array:
         return self.range_sigma + self.range_sigma_growth * ranges
 
-    def is_inside(self, ranges: FloatArray, bearings: FloatArray) -> BoolArray:
+    def is_inside(self, ranges: Array, bearings: Array) -> BoolArray:
         near = (ranges >= self.range_min) & (ranges <= self.range_max)
         return near & (np.abs(bearings) <= self.fov / 2)
 
-    def probabilities(self, ranges: FloatArray) -> FloatArray:
-        """Return the probabilities of detection at true ranges (m,)."""
+    def probabilities(self, ranges: Array) -> Array:
+        """Probabilities of detection at true ranges (m,)."""
         return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
 
-    def systematic_errors(self, ranges: FloatArray) -> FloatArray:
-        """Return how much longer (m) true ranges (m,) read than they are."""
+    def systematic_errors(self, ranges: Array) -> Array:
+        """Systematic errors (m,) of true ranges (m,), in m."""
         biased = self.range_bias and len(self.range_bias_at) > 0
         errors = np.interp(ranges, self.range_bias_at, self.range_bias_values) if biased else 0.0
         beyond = np.maximum(ranges - self.range_bend_from, 0.0)
         return np.asarray(errors + self.range_bend * beyond**2)
 
 
-def measure_twists(
-    twists: FloatArray, dt: float, noise: OdometryNoise, rng: Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Return `(1 + scale) [vx, vy]`, `wz + bias` (N, 3), `dt` s apart, with noise, and [scale, bias]."""
+def measure_twists(twists: Array, dt: float, noise: OdometryNoise, rng: Generator) -> tuple[Array, Array]:
+    """`(1 + scale) [vx, vy]`, `wz + bias` (N, 3), `dt` s apart, with noise, and [scale, bias]."""
     scale = noise.scale * rng.standard_normal()
     bias = noise.gyro_bias * rng.standard_normal()
     white = rng.standard_normal(twists.shape) * np.array(noise.white)
@@ -156,33 +140,31 @@ def measure_twists(
     return measured, np.array([scale, bias])
 
 
-def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> FloatArray:
-    """Return Gauss-Markov processes of unit variance along axis 0; neighbours correlate by `exp(-step)`."""
+def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> Array:
+    """Draw Gauss-Markov processes of unit variance along axis 0; neighbours correlate by `exp(-step)`."""
     rho = np.exp(-step)
     drawn = rng.standard_normal(shape)
     drawn[1:] *= np.sqrt(1.0 - rho**2)
     return np.asarray(scipy.signal.lfilter([1.0], [1.0, -rho], drawn, axis=0))
 
 
-def seen_from(pose: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return ranges (m,) and bearings (m,) in [-pi, pi) of points (m, 2) from a pose [x, y, theta]."""
+def seen_from(pose: Array, points: Array) -> tuple[Array, Array]:
+    """Ranges (m,) and bearings (m,) in [-pi, pi) of points (m, 2) from a pose [x, y, theta]."""
     step = points - pose[:2]
     bearings = np.arctan2(step[:, 1], step[:, 0]) - pose[2]
     return np.hypot(step[:, 0], step[:, 1]), (bearings + np.pi) % (2 * np.pi) - np.pi
 
 
 def polar_detections(
-    t: float, ranges: FloatArray, bearings: FloatArray, labels: IntArray, settings: SensorSettings
+    t: float, ranges: Array, bearings: Array, labels: IntArray, settings: SensorSettings
 ) -> Detections:
-    """Return measured ranges and bearings (m,) as a cycle, with the covariances of the sensor's noise."""
+    """Make a cycle of measured ranges and bearings (m,), with the covariances of the sensor's noise."""
     points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
     along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
     return Detections(t, points, polar_covariances(bearings, along, across), labels)
 
 
-def false_positives(
-    settings: SensorSettings, rng: Generator
-) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+def false_positives(settings: SensorSettings, rng: Generator) -> tuple[Array, Array, IntArray, IntArray]:
     """Draw detections of nothing, uniform over the area of the field, with either boundary's label."""
     count = int(rng.poisson(settings.false_positives))
     ranges = np.sqrt(rng.uniform(settings.range_min**2, settings.range_max**2, count))
@@ -192,7 +174,7 @@ def false_positives(
 
 
 class ConeSensor:
-    def __init__(self, cones: FloatArray, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
+    def __init__(self, cones: Array, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
         blind_rng, self._cone_rng, self._false_rng, self._slow_rng, self._second_rng, self._drop_rng = (
             rng.spawn(6)
         )
@@ -203,9 +185,9 @@ class ConeSensor:
         self._slow = self._slow_rng.standard_normal((CAMERAS, 2, len(cones)))
 
     def detect(
-        self, t: float, pose: FloatArray, scale: float = 0.0, bias: float = 0.0
+        self, t: float, pose: Array, scale: float = 0.0, bias: float = 0.0
     ) -> tuple[Detections, IntArray]:
-        """Return a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
+        """Detect a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
 
         The second result is the true cone of each detection (m,).
         """
@@ -220,8 +202,8 @@ class ConeSensor:
         return detections.where(kept), cones[kept]
 
     def _detect_cones(
-        self, pose: FloatArray, scale: float, bias: float
-    ) -> tuple[FloatArray, FloatArray, IntArray, IntArray]:
+        self, pose: Array, scale: float, bias: float
+    ) -> tuple[Array, Array, IntArray, IntArray]:
         settings, rng = self._settings, self._cone_rng
         ranges, bearings = seen_from(pose, self._cones[self._seen])
         inside = settings.is_inside(ranges, bearings)
@@ -243,8 +225,8 @@ class ConeSensor:
         index = np.nonzero(rows)[1]
         return ranges[rows], bearings[rows], labels[index], cones[index]
 
-    def _errors(self, white: FloatArray, cones: IntArray) -> FloatArray:
-        """Return errors (2, 2, m) of unit variance by camera, range or bearing, and cone.
+    def _errors(self, white: Array, cones: IntArray) -> Array:
+        """Errors (2, 2, m) of unit variance by camera, range or bearing, and cone.
 
         Each cone's slow errors are Gauss-Markov processes that go on while it is not seen.
         """

@@ -1,7 +1,7 @@
 """A drive on a track: track, vehicle and sensors give a log with truth; and sensors of a real car by name."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any, Final, Self
 
@@ -9,12 +9,16 @@ import numpy as np
 from numpy.random import Generator
 
 from pathspace_graph.errors import SettingsError, check_name
-from pathspace_graph.io.log import SENSOR, Detections, Log, SensorInfo, Truth, without_stated_noise
+from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.io.covariances import SIGMA_DETECTIONS, ray_covariances
+from pathspace_graph.io.log import SIGMA_ODOMETRY, Detections, Log, SensorInfo, Truth
+from pathspace_graph.io.overrides import leaves
 from pathspace_graph.labels import NAMES, UNKNOWN
 from pathspace_graph.lengths import scaled
+from pathspace_graph.settings.checked import Checked
 
 from .cameras import CAMERA, CAMERA_FAULTS, INS, INS_RATE, DrawnCar, draw_car
-from .curves import FloatArray, IntArray
 from .faults import (
     Faults,
     OdometryFaults,
@@ -32,7 +36,7 @@ from .vehicle import Drive, VehicleSettings, displacements, drive
 
 
 @dataclass(frozen=True)
-class SimulationSettings:
+class SimulationSettings(Checked, group=""):
     """A simulated drive."""
 
     laps: int = 5
@@ -40,24 +44,21 @@ class SimulationSettings:
     vehicle: VehicleSettings = field(default_factory=VehicleSettings)
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
     sensor: SensorSettings = field(default_factory=SensorSettings)
-    line: LineSettings = field(default_factory=LineSettings, repr=False)
-    faults: Faults = field(default_factory=Faults, repr=False)
-    scale: float = field(default=1.0, repr=False)
+    line: LineSettings = field(default_factory=LineSettings)
+    faults: Faults = field(default_factory=Faults)
+    scale: float = 1.0
     """Factor of all lengths and speeds: 0.1 for a model car of 1:10, 3 for a road."""
 
-    draw: bool = field(default=False, repr=False)
+    draw: bool = False
     """Whether sensor, odometry, their faults and the vehicle are drawn by the seed (`sim.cameras:draw_car`).
     The log states nothing of their noise. Of those only the vehicle's overrun can be set beside it."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.draw:
             self._check_draw()
-        if self.laps < 1:
-            raise SettingsError(f"laps: expected at least 1, found {self.laps}")
         if self.faults.odometry.false_travel and not self.vehicle.stand:
             raise SettingsError("faults.odometry.false_travel: expected vehicle.stand above 0, found 0")
-        if not 0.0 < self.scale < np.inf:
-            raise SettingsError(f"scale: expected a positive number, found {self.scale}")
 
     def _check_draw(self) -> None:
         """Raise SettingsError where a group that is drawn is neither the default nor a preset."""
@@ -71,10 +72,10 @@ class SimulationSettings:
         }
         for group, values in known.items():
             if attrgetter(group)(self) not in values:
-                raise SettingsError(f"draw: expected no setting of {group} beside it, as it is drawn")
+                raise SettingsError(f"draw: expected no setting of {group} beside it, since it is drawn")
 
     def with_car(self, car: DrawnCar) -> Self:
-        """Return the settings of the same drive with a drawn car."""
+        """Replace the car by a drawn one."""
         faults = replace(self.faults, sensor=car.sensor_faults, odometry=car.odometry_faults)
         vehicle = replace(car.vehicle, overrun=self.vehicle.overrun)
         changed = replace(self, draw=False, vehicle=vehicle, faults=faults)
@@ -82,7 +83,7 @@ class SimulationSettings:
 
 
 def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
-    """Return the log of a drive; a seed gives the same log to the byte.
+    """Simulate a drive; a seed gives the same log to the byte.
 
     Wander, odometry, sensor, lost colours and a drawn car have random streams of their own, so that a setting
     of one does not shift the others. A cycle in which nothing is detected is not in the log.
@@ -124,15 +125,28 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
 
 
 def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
-    """Return a log of these settings that states nothing of its noise, which its truth has instead."""
+    """Remove the stated noise from a log of these settings; its truth has it instead."""
     sensor = settings.sensor
     sigmas = [sensor.range_sigma * settings.scale, sensor.range_sigma_growth, sensor.bearing_sigma]
     truth = log.truth and replace(log.truth, rays=np.array(sigmas))
-    return without_stated_noise(replace(log, truth=truth, source={**log.source, "draw": "True"}))
+    cycles = (
+        replace(cycle, covariances=ray_covariances(cycle.points_vehicle, SIGMA_DETECTIONS))
+        for cycle in log.cycles
+    )
+    return replace(
+        log,
+        cycles=tuple(cycles),
+        odometry_sigma=np.array(SIGMA_ODOMETRY),
+        sensor=SensorInfo(),
+        source={**log.source, "draw": "True"},
+        odometry_stated=False,
+        detections_stated=False,
+        truth=truth,
+    )
 
 
-def _noise(settings: SimulationSettings) -> FloatArray | None:
-    """Return the noise (6,) in the order of `io.log:NOISE`, or None where all of it is white."""
+def _noise(settings: SimulationSettings) -> Array | None:
+    """Noise (6,) in the order of `io.header:TRUE_ERRORS`, or None where all of it is white."""
     odometry, sensor = settings.odometry, settings.sensor
     if not (any(odometry.slow) or sensor.slow_range or sensor.slow_bearing):
         return None
@@ -140,8 +154,8 @@ def _noise(settings: SimulationSettings) -> FloatArray | None:
     return np.array([*drift, sensor.slow_range, sensor.slow_bearing, sensor.slow_time])
 
 
-def _bend(sensor: SensorSettings) -> FloatArray | None:
-    """Return the bend of the ranges (2,) in the order of `io.log:BEND`, or None where they don't bend."""
+def _bend(sensor: SensorSettings) -> Array | None:
+    """Bend of the ranges (2,) in the order of `io.header:TRUE_ERRORS`, None where they don't bend."""
     return np.array([sensor.range_bend, sensor.range_bend_from]) if sensor.range_bend else None
 
 
@@ -153,14 +167,10 @@ def _sensor_info(settings: SimulationSettings) -> SensorInfo:
 
 
 def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
-    source = {"track": track.name, "seed": str(seed), "settings": repr(settings)}
-    source |= {"scale": str(settings.scale)} if settings.scale != 1.0 else {}
-    for group in ("odometry", "sensor", "line", "vehicle", "faults.sensor", "faults.odometry"):
-        part = attrgetter(group)(settings)
-        changed = [entry.name for entry in fields(part) if not entry.repr]
-        changed = [name for name in changed if getattr(part, name) != getattr(type(part)(), name)]
-        source |= {f"{group}.{name}": str(getattr(part, name)) for name in changed}
-    return source if settings.faults == Faults() else source | {"faults": repr(settings.faults)}
+    """Track, seed, and each setting that isn't the default."""
+    defaults = leaves(SimulationSettings())
+    changed = {name: str(value) for name, value in leaves(settings).items() if value != defaults[name]}
+    return {"track": track.name, "seed": str(seed), **changed}
 
 
 def _sensor(track: Track, settings: SimulationSettings, rng: Generator) -> ConeSensor | LineSensor:
@@ -178,7 +188,7 @@ def _perceive(
     sensor_rng: Generator,
     colour_rng: Generator,
 ) -> tuple[list[Detections], IntArray]:
-    """Return the cycles of a sensor that is mounted badly and fails at times, and their associations.
+    """Detect the cycles of a faulty sensor, and their associations.
 
     A lap is `lap` m long.
     """
@@ -208,8 +218,8 @@ def _perceive(
     return cycles, np.concatenate(associations)
 
 
-def _poses_at(driven: Drive, stamps: FloatArray) -> FloatArray:
-    """Return true poses (n, 3) at any stamps within the drive; the twist before each is held until then."""
+def _poses_at(driven: Drive, stamps: Array) -> Array:
+    """True poses (n, 3) at any stamps within the drive; the twist before each is held until then."""
     index = np.searchsorted(driven.t, stamps, side="right") - 1
     poses = driven.poses[index]
     return poses + displacements(poses[:, 2], driven.twists[index], stamps - driven.t[index])
@@ -228,7 +238,7 @@ PRESETS: Final[dict[str, dict[str, dict[str, Any]]]] = {
 
 
 def preset(names: Mapping[str, str]) -> SimulationSettings:
-    """Return the defaults of a simulation with named presets for some groups."""
+    """Defaults of a simulation with named presets for some groups."""
     settings = SimulationSettings()
     for group, name in names.items():
         check_name(name, PRESETS[group], f"{group}: expected a known preset")

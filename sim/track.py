@@ -7,24 +7,25 @@ from typing import Any, Final
 
 import numpy as np
 
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
 from . import curves
-from .curves import CentreLine, FloatArray, IntArray, direction, left_normals
+from .curves import CentreLine, direction, left_normals
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
     """Cones of a track, in a frame of its own."""
 
-    left: FloatArray  # cones of the left boundary in driving order (n, 2) in m
-    right: FloatArray  # cones of the right boundary in driving order (m, 2) in m
-    other: FloatArray  # cones of no boundary, such as those of a gate (k, 2) in m
+    left: Array  # cones of the left boundary in driving order (n, 2) in m
+    right: Array  # cones of the right boundary in driving order (m, 2) in m
+    other: Array  # cones of no boundary, such as those of a gate (k, 2) in m
     closed: bool  # whether the last cones are followed by the first
-    start: FloatArray  # pose [x, y, theta] (3,) from which the vehicle starts, in m, m, rad
+    start: Array  # pose [x, y, theta] (3,) from which the vehicle starts, in m, m, rad
     name: str
     other_labels: IntArray | None = None  # labels (k,) of the other cones, by default UNKNOWN
-    path: FloatArray | None = None  # (k, 2) along which the road is driven, if not its middle (m)
+    path: Array | None = None  # (k, 2) along which the road is driven, if not its middle (m)
 
     @cached_property
     def centre_line(self) -> CentreLine:
@@ -34,14 +35,14 @@ class Track:
         return curves.fit_centre_line(self.left, self.right, self.closed, self.start[:2])
 
     @property
-    def rows(self) -> tuple[FloatArray, FloatArray]:
-        """The cones of the left and of the right boundary as they are passed, those of each round anew."""
+    def rows(self) -> tuple[Array, Array]:
+        """Cones of the left and the right boundary in passing order, repeated in each round."""
         if self.closed or self.path is None:
             return self.left, self.right
         return _passed(self.left, self.path), _passed(self.right, self.path)
 
     @property
-    def cones(self) -> FloatArray:
+    def cones(self) -> Array:
         return np.vstack([self.left, self.right, self.other])
 
     @property
@@ -50,8 +51,8 @@ class Track:
         return np.concatenate([np.repeat([LEFT, RIGHT], [len(self.left), len(self.right)]), other])
 
 
-def _passed(cones: FloatArray, path: FloatArray) -> FloatArray:
-    """Return the cones (n, 2) beside a path (k, 2), in the order in which it passes them, some repeatedly."""
+def _passed(cones: Array, path: Array) -> Array:
+    """Order cones (n, 2) as a path (k, 2) passes them, some repeatedly."""
     apart = np.linalg.norm(cones[:, None] - path, axis=2)
     beside = apart < BESIDE * np.median(apart.min(axis=1))
     passes = list[tuple[int, int]]()
@@ -91,7 +92,7 @@ SPACING: Final = 5.0  # distance of the cones along it (m)
 
 
 def skidpad() -> Track:
-    """Return the two circles, entered and left along x between them: two rounds right, two rounds left.
+    """Skidpad: two circles, entered and left along x between them: two rounds right, two rounds left.
 
     Cones have the colour of their side as each circle is driven; those of the lanes are orange.
     """
@@ -123,16 +124,16 @@ def skidpad() -> Track:
     )
 
 
-def _circle(radius: float, angles: FloatArray) -> FloatArray:
+def _circle(radius: float, angles: Array) -> Array:
     return radius * np.column_stack([np.sin(angles), np.cos(angles)])
 
 
-def _line(begin: float, end: float) -> FloatArray:
+def _line(begin: float, end: float) -> Array:
     return np.arange(begin, end, curves.STEP)[:, None] * [1.0, 0.0]
 
 
 def acceleration() -> Track:
-    """Return the straight along x with its gates, and the road on which vehicles brake."""
+    """Acceleration: a straight along x with its gates, and the road on which vehicles brake."""
     x = np.arange(0.0, STRETCH + BRAKING + SPACING / 2, SPACING)
     left = np.column_stack([x, np.full(len(x), LANE / 2)])
     gates = [(at, y) for at in (0.3, STRETCH + 0.3) for y in (-LANE / 2 - 0.3, LANE / 2 + 0.3)]

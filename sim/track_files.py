@@ -12,12 +12,13 @@ from msgspec import Meta, Struct, field
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io import parsing as limits
 from pathspace_graph.io.parsing import Table, parse_yaml, read_table, read_text, typed
 from pathspace_graph.labels import BIG_ORANGE, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
-from .curves import FloatArray, arc_lengths, direction, left_normals, resample, ring, unit
+from .curves import arc_lengths, direction, left_normals, resample, ring, unit
 from .driving_order import driving_order
 from .track import Track
 
@@ -48,7 +49,7 @@ class TrackFormat:
 
 
 def read_track(path: Path | str) -> Track:
-    """Return the track in a file, with its cones in driving order; an InputError names the row or the key."""
+    """Read the track in a file, its cones in driving order; an InputError names the row or key."""
     path = Path(path)
     if not path.is_file():
         raise InputError(path, f"expected a track file, found {'a folder' if path.is_dir() else 'none'}")
@@ -83,7 +84,7 @@ def _check(path: Path, track: Track) -> None:
         raise InputError(path, f"{expected}, found them against the start's heading")
 
 
-def _check_size(path: Path, row: FloatArray, name: str) -> None:
+def _check_size(path: Path, row: Array, name: str) -> None:
     length = float(arc_lengths(row)[-1]) if len(row) else 0.0
     if len(row) > limits.MAX_CONES or length > limits.MAX_TRACK_LENGTH:
         expected = f"expected at most {limits.MAX_CONES} cones over {limits.MAX_TRACK_LENGTH:g} m as {name}"
@@ -157,7 +158,7 @@ def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
     return _with_hidden(track, hidden) if len(hidden) else track
 
 
-def _with_hidden(track: Track, hidden: FloatArray) -> Track:
+def _with_hidden(track: Track, hidden: Array) -> Track:
     left, right = (
         row[~(row[:, None] == hidden).all(axis=2).any(axis=1)] for row in (track.left, track.right)
     )
@@ -165,8 +166,8 @@ def _with_hidden(track: Track, hidden: FloatArray) -> Track:
     return replace(track, left=left, right=right, path=track.centre_line.points(s))
 
 
-def _pacsim_cones(cones: Cones) -> tuple[FloatArray, NDArray[np.str_]]:
-    """Return the points (n, 2) and the classes (n,) of a list of cones."""
+def _pacsim_cones(cones: Cones) -> tuple[Array, NDArray[np.str_]]:
+    """Points (n, 2) and the classes (n,) of a list of cones."""
     points = _points([cone.position for cone in cones or ()])
     return points, np.array([str(cone.kind) for cone in cones or ()], str)
 
@@ -180,11 +181,11 @@ def _fssim(path: Path, content: Mapping[str, Any]) -> Track:
     return Track(left, right, np.concatenate([small, big]), True, start, path.stem, kinds)
 
 
-def _points(rows: Points) -> FloatArray:
+def _points(rows: Points) -> Array:
     return np.array([row[:2] for row in rows or ()], float).reshape(-1, 2)
 
 
-def _without_repeats(row: FloatArray, closed: bool) -> FloatArray:
+def _without_repeats(row: Array, closed: bool) -> Array:
     if not len(row):
         return row
     row = row[np.append(True, np.linalg.norm(np.diff(row, axis=0), axis=1) > REPEAT_DISTANCE)]
@@ -233,10 +234,8 @@ def _eufs(path: Path, _: Table) -> Track:
     return Track(left, right, np.concatenate(others), order.closed, start, path.stem, labels)
 
 
-def _eufs_start(
-    table: Table, tags: NDArray[np.str_], points: FloatArray, left: FloatArray, right: FloatArray
-) -> FloatArray:
-    """Return the pose of the first `car_start`, or one between the first blue cone and its opposite."""
+def _eufs_start(table: Table, tags: NDArray[np.str_], points: Array, left: Array, right: Array) -> Array:
+    """Pose of the first `car_start`, or one between the first blue cone and its opposite."""
     rows = np.flatnonzero(tags == "car_start")
     if len(rows):
         text = table.columns.get("direction", [""] * len(table))[rows[0]].strip()
@@ -253,8 +252,8 @@ def _eufs_start(
     return np.append((left[0] + opposite) / 2, math.atan2(-across[0], across[1]))
 
 
-def _without_duplicates(cones: FloatArray) -> FloatArray:
-    """Return the cones (n, 2) that are not within the duplicate distance of one kept before."""
+def _without_duplicates(cones: Array) -> Array:
+    """Drop cones (n, 2) within the duplicate distance of one kept before."""
     kept, count = np.empty_like(cones), 0
     for cone in cones:
         if (np.linalg.norm(kept[:count] - cone, axis=1) >= DUPLICATE_DISTANCE).all():
@@ -278,8 +277,8 @@ def _tum(path: Path, _: Table) -> Track:
     return Track(left, right, np.zeros((0, 2)), True, start, path.stem)
 
 
-def _tum_circuit(path: Path) -> FloatArray:
-    """Return checked rows [x, y, right width, left width], with the first repeated at the end (n + 1, 4)."""
+def _tum_circuit(path: Path) -> Array:
+    """Checked rows [x, y, right width, left width], with the first repeated at the end (n + 1, 4)."""
     table = read_table(path, TUM_COLUMNS, comment="#")
     circuit = table.stack(TUM_COLUMNS)
     widths = circuit[:, 2:]

@@ -9,9 +9,11 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.settings.checked import AtLeast0, Checked
 
 from . import curves
-from .curves import FloatArray, arc_lengths, left_normals, ring, unit
+from .curves import arc_lengths, left_normals, ring, unit
 from .track import Track
 
 MAX_ATTEMPTS: Final = 500  # two in three keep the default rules; contradicting ones fail them all
@@ -28,7 +30,7 @@ CHICANE_PROBABILITY: Final = 0.3  # that it becomes a chicane
 
 
 @dataclass(frozen=True)
-class TrackGeneratorSettings:
+class TrackGeneratorSettings(Checked, group="generator"):
     """Rules that a generated track keeps."""
 
     lap_length: tuple[float, float] = (220.0, 400.0)
@@ -37,7 +39,7 @@ class TrackGeneratorSettings:
     """Least and greatest distance of the boundaries, constant along a track (m); the rules ask for 3."""
     cones: int = 200
     """Cones of both boundaries together, as nearly as the gaps allow."""
-    separation: float = 1.5
+    separation: AtLeast0 = 1.5
     """Least distance of boundaries of different stretches (m)."""
     corners: tuple[int, int] = (5, 9)
     """Least and greatest number of corners of the layout that the elements are put into."""
@@ -45,6 +47,7 @@ class TrackGeneratorSettings:
     """Least and greatest number of hairpins put into the layout, whose corners may be hairpins as well."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("lap_length", "width", "corners", "hairpins"):
             low, high = getattr(self, name)
             if not 0 <= low <= high:
@@ -60,7 +63,7 @@ class TrackGeneratorSettings:
 
 
 def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = None) -> Track:
-    """Return a random closed track that keeps the rules and starts on its longest straight."""
+    """Generate a random closed track that keeps the rules and starts on its longest straight."""
     settings = settings or TrackGeneratorSettings()
     for _ in range(MAX_ATTEMPTS):
         width = rng.uniform(*settings.width)
@@ -74,8 +77,8 @@ def generate_track(rng: Generator, settings: TrackGeneratorSettings | None = Non
 class _Layout(NamedTuple):
     """A polygon whose corners (n, 2) are to be rounded by arcs of radii (n,), in m."""
 
-    corners: FloatArray
-    radii: FloatArray
+    corners: Array
+    radii: Array
 
 
 def _least_radius(width: float) -> float:
@@ -83,7 +86,7 @@ def _least_radius(width: float) -> float:
 
 
 def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _Layout | None:
-    """Return a star-shaped polygon with hairpins on some sides, or None where a corner cannot be rounded."""
+    """Draw a star-shaped polygon with hairpins on some sides, or None where a corner cannot be rounded."""
     count = int(rng.integers(*settings.corners, endpoint=True))
     angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
     distances = rng.uniform(0.35, 1.0, count)
@@ -137,18 +140,18 @@ def _rounded(layout: _Layout, least: float) -> _Layout | None:
     return _Layout(layout.corners, radii) if (radii >= least - 1e-9).all() else None
 
 
-def _turns(corners: FloatArray) -> FloatArray:
+def _turns(corners: Array) -> Array:
     before = corners - np.roll(corners, 1, axis=0)
     after = np.roll(before, -1, axis=0)
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
     return np.asarray(np.arctan2(cross, np.sum(before * after, axis=1)))
 
 
-def _curve(layout: _Layout, rng: Generator) -> FloatArray:
-    """Return samples (n, 2) of the centre line: straights and their elements, joined by eased arcs."""
+def _curve(layout: _Layout, rng: Generator) -> Array:
+    """Samples (n, 2) of the centre line: straights and their elements, joined by eased arcs."""
     (corners, radii), turns = layout, _turns(layout.corners)
     tangent = radii * np.tan(np.abs(turns) / 2)
-    pieces: list[FloatArray] = []
+    pieces: list[Array] = []
     for k in range(len(turns)):
         following = (k + 1) % len(turns)
         side = corners[following] - corners[k]
@@ -165,16 +168,16 @@ def _curve(layout: _Layout, rng: Generator) -> FloatArray:
     )
 
 
-def _arc(begin: FloatArray, direction: FloatArray, radius: float, turn: float) -> FloatArray:
-    """Return samples of an arc from `begin` on, first along `direction`."""
+def _arc(begin: Array, direction: Array, radius: float, turn: float) -> Array:
+    """Samples of an arc from `begin` on, first along `direction`."""
     angles = turn * np.linspace(0.0, 1.0, max(int(radius * abs(turn) / curves.STEP), 1), endpoint=False)
     normal = left_normals(direction) * np.sign(turn)
     forward, sideways = np.sin(np.abs(angles))[:, None], 1 - np.cos(angles)[:, None]
     return np.asarray(begin + radius * (forward * direction + sideways * normal))
 
 
-def _straight(begin: FloatArray, end: FloatArray, rng: Generator) -> FloatArray:
-    """Return samples from `begin` to `end`, by chance with a slalom or a chicane where there is room."""
+def _straight(begin: Array, end: Array, rng: Generator) -> Array:
+    """Samples from `begin` to `end`, by chance with a slalom or a chicane where there is room."""
     length = float(np.linalg.norm(end - begin))
     if length < curves.STEP:
         return begin[None]
@@ -188,8 +191,8 @@ def _straight(begin: FloatArray, end: FloatArray, rng: Generator) -> FloatArray:
     return begin + along[:, None] * direction + offset[:, None] * left_normals(direction)
 
 
-def _slalom(along: FloatArray, length: float, rng: Generator) -> FloatArray:
-    """Return two or three eased waves `A sin(2 pi s / wavelength)`, or zeros where there is no room."""
+def _slalom(along: Array, length: float, rng: Generator) -> Array:
+    """Draw two or three eased waves `A sin(2 pi s / wavelength)`, or zeros where there is no room."""
     wavelength = rng.uniform(14.0, 22.0)
     waves = min(int(length / wavelength), 3)
     if waves < 2:
@@ -203,8 +206,8 @@ def _slalom(along: FloatArray, length: float, rng: Generator) -> FloatArray:
     return np.asarray(wave * ease**2 * (3 - 2 * ease))
 
 
-def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
-    """Return a shift to one side and back by half cosine waves, or zeros where there is no room."""
+def _chicane(along: Array, length: float, rng: Generator) -> Array:
+    """Draw a shift to one side and back by half cosine waves, or zeros where there is no room."""
     shift, hold = rng.uniform(8.0, 13.0), rng.uniform(0.0, 5.0)
     total = 2 * shift + hold
     if length < total:
@@ -216,7 +219,7 @@ def _chicane(along: FloatArray, length: float, rng: Generator) -> FloatArray:
     return np.asarray(rng.choice([-1.0, 1.0]) * depth * (1 - np.cos(np.pi * part)) / 2)
 
 
-def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettings) -> bool:
+def _keeps_rules(curve: Array, width: float, settings: TrackGeneratorSettings) -> bool:
     bend = np.abs(_curvature(curve))
     return bool(
         settings.lap_length[0] <= arc_lengths(ring(curve))[-1] <= settings.lap_length[1]
@@ -226,7 +229,7 @@ def _keeps_rules(curve: FloatArray, width: float, settings: TrackGeneratorSettin
     )
 
 
-def _curvature(curve: FloatArray) -> FloatArray:
+def _curvature(curve: Array) -> Array:
     after, before = np.roll(curve, -1, axis=0), np.roll(curve, 1, axis=0)
     return curves.curvature((after - before) / 2, after - 2 * curve + before)
 
@@ -240,16 +243,16 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
     return int(bad[longest] + 1) % len(good), int(gaps[longest])
 
 
-def _is_separate(curve: FloatArray, distance: float) -> bool:
-    """Return whether samples nearer than `distance` are of one stretch, apart by less than half a circle."""
+def _is_separate(curve: Array, distance: float) -> bool:
+    """Whether samples nearer than `distance` are of one stretch, apart by less than half a circle."""
     pairs = scipy.spatial.KDTree(curve).query_pairs(distance, output_type="ndarray")
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
     apart = np.minimum(apart, len(curve) - apart) * curves.STEP
     return bool((apart < np.pi * distance / 2).all())
 
 
-def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSettings, rng: Generator) -> Track:
-    """Return the track that starts early on the longest straight, with cones along both boundaries."""
+def _with_cones(curve: Array, width: float, settings: TrackGeneratorSettings, rng: Generator) -> Track:
+    """Start early on the longest straight, and place cones along both boundaries."""
     first, run = _longest_run(np.abs(_curvature(curve)) < 1 / STRAIGHT_RADIUS)
     curve = np.roll(curve, -(first + run // 3), axis=0)
     along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
@@ -264,7 +267,7 @@ def _with_cones(curve: FloatArray, width: float, settings: TrackGeneratorSetting
     return Track(left, right, np.zeros((0, 2)), True, start, "generated")
 
 
-def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackGeneratorSettings) -> float:
+def _straight_gap(rows: list[Array], crowding: Array, settings: TrackGeneratorSettings) -> float:
     def excess(gap: float) -> float:
         return float(sum(_cumulative(row, gap, crowding)[-1] for row in rows)) - settings.cones
 
@@ -276,8 +279,8 @@ def _straight_gap(rows: list[FloatArray], crowding: FloatArray, settings: TrackG
     return float(scipy.optimize.brentq(excess, MIN_CONE_GAP, widest))
 
 
-def _cumulative(row: FloatArray, gap: float, crowding: FloatArray) -> FloatArray:
-    """Return the number of cones from the first sample to each, and round to the first again (n + 1,).
+def _cumulative(row: Array, gap: float, crowding: Array) -> Array:
+    """Number of cones from the first sample to each, and round to the first again (n + 1,).
 
     They are `gap` (m) apart where nothing crowds them.
     """
@@ -285,7 +288,7 @@ def _cumulative(row: FloatArray, gap: float, crowding: FloatArray) -> FloatArray
     return np.concatenate([[0.0], np.cumsum(np.diff(arc_lengths(ring(row))) * density)])
 
 
-def _place_cones(row: FloatArray, total: FloatArray, rng: Generator) -> FloatArray:
+def _place_cones(row: Array, total: Array, rng: Generator) -> Array:
     """Place cones (k, 2) along a closed row by their cumulative number, with a random offset."""
     count = int(np.ceil(total[-1]))
     at = (np.arange(count) + rng.random()) * total[-1] / count

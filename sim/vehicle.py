@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import scipy  # which imports its modules when they are used
 from numpy.random import Generator
 
-from pathspace_graph.errors import SettingsError, check_numbers
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.settings.checked import AtLeast0, Checked, Signed
 
-from .curves import CentreLine, FloatArray, arc_lengths, curvature, direction, left_normals
+from .curves import CentreLine, arc_lengths, curvature, direction, left_normals
 from .track import Track
 
 if TYPE_CHECKING:
@@ -23,12 +25,12 @@ MIN_PATH: Final = 10  # least number of samples of a path
 
 
 @dataclass(frozen=True)
-class VehicleSettings:
+class VehicleSettings(Checked):
     """How the vehicle drives."""
 
     speed_max: float = 12.0
     """Greatest speed (m/s)."""
-    speed_start: float = 0.0
+    speed_start: AtLeast0 = 0.0
     """Speed at the start pose (m/s)."""
     acceleration_lateral: float = 5.0
     """Greatest lateral acceleration (m/s^2), which limits the speed in corners."""
@@ -36,31 +38,27 @@ class VehicleSettings:
     """Greatest longitudinal acceleration (m/s^2)."""
     deceleration: float = 4.0
     """Greatest longitudinal deceleration (m/s^2)."""
-    wander: float = 0.3
+    wander: AtLeast0 = 0.3
     """Largest distance of the smooth lateral wander from the middle (m)."""
     wander_wavelengths: tuple[float, float] = (15.0, 60.0)
     """Shortest and longest wavelength of the wander (m)."""
-    half_width: float = 0.75
+    half_width: AtLeast0 = 0.75
     """Half the vehicle's width (m), which the wander keeps `margin` away from the cones."""
-    margin: float = 0.25
+    margin: AtLeast0 = 0.25
     """Distance of the vehicle's side from the cones where the track is wide enough (m)."""
     settle_distance: float = 5.0
     """Distance over which the vehicle moves from its start pose to the middle (m)."""
-    overrun: float = 10.0
+    overrun: Signed = 10.0
     """Distance driven beyond the last lap's end (m); where it is negative, the road stays open."""
-    rest: float = 0.0
+    rest: AtLeast0 = 0.0
     """Time at the start pose before the vehicle drives (s)."""
-    stand: float = field(default=0.0, repr=False)
+    stand: AtLeast0 = 0.0
     """Time for which the vehicle stands at the end of the drive, after braking (s); it drives on if 0."""
     rate: float = 50.0
     """Rate of the odometry and of the true poses (Hz)."""
 
     def __post_init__(self) -> None:
-        positive = ("speed_max", "acceleration_lateral", "acceleration", "deceleration")
-        check_numbers(self, "vehicle", (*positive, "settle_distance", "rate"), "a positive number")
-        at_least_0 = ("speed_start", "rest", "stand", "wander", "half_width", "margin")
-        check_numbers(self, "vehicle", at_least_0, "a number of at least 0")
-        check_numbers(self, "vehicle", ("overrun",), "a number")
+        super().__post_init__()
         shortest, longest = self.wander_wavelengths
         if not 0 < shortest <= longest < np.inf:
             raise SettingsError(f"vehicle.wander_wavelengths: expected 0 < a <= b, found {shortest, longest}")
@@ -68,9 +66,9 @@ class VehicleSettings:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    t: FloatArray  # stamps (N,) in s, from 0
-    poses: FloatArray  # true poses [x, y, theta] (N, 3), map frame, from (0, 0, 0); theta is not wrapped
-    twists: FloatArray  # true body twists [vx, vy, wz] (N, 3), each held until the next stamp
+    t: Array  # stamps (N,) in s, from 0
+    poses: Array  # true poses [x, y, theta] (N, 3), map frame, from (0, 0, 0); theta is not wrapped
+    twists: Array  # true body twists [vx, vy, wz] (N, 3), each held until the next stamp
 
 
 def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> Drive:
@@ -86,15 +84,15 @@ def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) ->
     return Drive(t, integrate(twists[:-1], 1.0 / settings.rate), twists)
 
 
-def integrate(twists: FloatArray, dt: float | FloatArray) -> FloatArray:
+def integrate(twists: Array, dt: float | Array) -> Array:
     """Integrate body twists (N, 3), each constant for `dt`, to poses (N + 1, 3) from 0 by SE(2)'s exp."""
     theta = np.concatenate([[0.0], np.cumsum(twists[:, 2] * dt)])
     steps = displacements(theta[:-1], twists, dt)[:, :2]
     return np.column_stack([np.vstack([np.zeros(2), np.cumsum(steps, axis=0)]), theta])
 
 
-def displacements(theta: FloatArray, twists: FloatArray, dt: float | FloatArray) -> FloatArray:
-    """Return what body twists (N, 3), each constant for `dt`, add to poses with headings theta (N,)."""
+def displacements(theta: Array, twists: Array, dt: float | Array) -> Array:
+    """Displacements (N, 3) by body twists (N, 3), each constant for `dt`, from headings theta (N,)."""
     a, b = _exponential(twists[:, 2] * dt)
     dx = (a * twists[:, 0] - b * twists[:, 1]) * dt
     dy = (b * twists[:, 0] + a * twists[:, 1]) * dt
@@ -102,8 +100,8 @@ def displacements(theta: FloatArray, twists: FloatArray, dt: float | FloatArray)
     return np.column_stack([cos * dx - sin * dy, sin * dx + cos * dy, twists[:, 2] * dt])
 
 
-def _twists(poses: FloatArray, dt: float) -> FloatArray:
-    """Return body twists (N, 3), each of which leads to the next pose in `dt` (SE(2) logarithm)."""
+def _twists(poses: Array, dt: float) -> Array:
+    """Body twists (N, 3), each of which leads to the next pose in `dt` (SE(2) logarithm)."""
     step = np.diff(poses, axis=0)
     cos, sin = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     dx, dy = cos * step[:, 0] + sin * step[:, 1], -sin * step[:, 0] + cos * step[:, 1]
@@ -113,14 +111,14 @@ def _twists(poses: FloatArray, dt: float) -> FloatArray:
     return np.vstack([twists, twists[-1:]])
 
 
-def _exponential(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return `sin(angle) / angle` and `(1 - cos(angle)) / angle`, also at 0."""
+def _exponential(angle: Array) -> tuple[Array, Array]:
+    """`sin(angle) / angle` and `(1 - cos(angle)) / angle`, also at 0."""
     half = np.sinc(angle / (2 * np.pi))
     return np.sinc(angle / np.pi), np.sin(angle / 2) * half
 
 
 def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> CubicSpline:
-    """Return the path from the start pose on, nearly by arc length: the centre line with an offset."""
+    """Path from the start pose on, nearly by arc length: the centre line with an offset."""
     line = track.centre_line
     start = line.nearest(track.start)
     total = laps * line.length + settings.overrun if line.closed else line.length - start
@@ -137,10 +135,8 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
     )
 
 
-def _settling(
-    line: CentreLine, start: float, pose: FloatArray, s: FloatArray, settings: VehicleSettings
-) -> FloatArray:
-    """Return a lateral offset (n,) that begins with the start pose's offset and slope and dies away."""
+def _settling(line: CentreLine, start: float, pose: Array, s: Array, settings: VehicleSettings) -> Array:
+    """Lateral offset (n,) that begins with the start pose's offset and slope and dies away."""
     point, tangent = line.points(np.array([start]))[0], line.tangents(np.array([start]))[0]
     normal = left_normals(tangent)
     offset = float(normal @ (pose[:2] - point))
@@ -151,7 +147,7 @@ def _settling(
     return np.asarray((offset + (slope + offset / settings.settle_distance) * s) * decay)
 
 
-def _wander(s: FloatArray, clearance: FloatArray, settings: VehicleSettings, rng: Generator) -> FloatArray:
+def _wander(s: Array, clearance: Array, settings: VehicleSettings, rng: Generator) -> Array:
     shortest, longest = settings.wander_wavelengths
     wavenumbers = 2 * np.pi * rng.uniform(1 / longest, 1 / shortest, WAVES)
     phases = rng.uniform(0.0, 2 * np.pi, WAVES)
@@ -161,8 +157,8 @@ def _wander(s: FloatArray, clearance: FloatArray, settings: VehicleSettings, rng
     return np.asarray(np.tanh(wave) * room * begin)
 
 
-def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> FloatArray:
-    """Return speeds (n,) at the path's knots that keep the acceleration limits, by two passes."""
+def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> Array:
+    """Speeds (n,) at the path's knots that keep the acceleration limits, by two passes."""
     s = path.x
     bend = np.abs(curvature(np.asarray(path(s, 1)), np.asarray(path(s, 2))))
     cornering2 = settings.acceleration_lateral / np.maximum(bend, np.finfo(float).tiny)
@@ -177,7 +173,7 @@ def _speed_profile(path: CubicSpline, settings: VehicleSettings) -> FloatArray:
     return np.sqrt(speed2)
 
 
-def _stations(path: CubicSpline, speeds: FloatArray, rate: float) -> FloatArray:
+def _stations(path: CubicSpline, speeds: Array, rate: float) -> Array:
     s = path.x
     durations = 2 * np.diff(s) / (speeds[1:] + speeds[:-1])
     knots_t = np.concatenate([[0.0], np.cumsum(durations)])

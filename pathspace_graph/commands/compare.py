@@ -86,7 +86,7 @@ def demo_command(options: Demo) -> Outcome:
 
 
 def map_with_both(log: Log, settings: MapperSettings) -> tuple[RunResult, RunResult]:
-    """Return the spline graph's result and the landmark graph's, which runs in another process."""
+    """Map with the spline graph, and with the landmark graph in another process."""
     with workers(2):  # with one job it would be run here, and first
         rival = Parallel(return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
         result = map_online(log, make_online(DEFAULT_ONLINE, settings, log))

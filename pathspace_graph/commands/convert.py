@@ -1,4 +1,4 @@
-"""`convert`: a ROS bag, CSV files of one's own or JSON lines as a log."""
+"""`convert`: a ROS bag, CSV files or JSON lines as a log."""
 
 from collections import Counter
 from dataclasses import replace
@@ -29,7 +29,7 @@ from .estimate import tell
 from .outcome import Outcome
 from .simulate import describe
 
-SUFFIXES: Final = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json")}  # of several in a folder
+SUFFIXES: Final = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json")}  # of records in a folder
 
 
 def convert_command(options: Convert) -> Outcome:
@@ -52,7 +52,7 @@ def convert_command(options: Convert) -> Outcome:
 
 
 def _records(options: Convert) -> list[Path]:
-    """Return the records in the source where it is a folder of several, none where it is one itself."""
+    """Records in a folder of several; none where the source is a record itself."""
     folder = options.source
     if not folder.is_dir() or (folder / "metadata.yaml").exists():
         return []
@@ -86,7 +86,7 @@ def _read(options: Convert, source: Path, rule: LabelRule) -> Recording:
 
 
 def with_measured_noise(log: Log) -> Log:
-    """Return a log whose noise is measured where nobody has stated it."""
+    """Measure the noise of a log where it is not stated."""
     if log.odometry_stated and log.detections_stated:
         return log
     scale, settings = scale_of(log), MapperSettings(kind=log.sensor.kind)
@@ -105,7 +105,7 @@ def with_measured_noise(log: Log) -> Log:
 
 
 def write_checked(log: Log, out: Path, source: Path) -> None:
-    """Write a log, or raise an InputError of its source where it would be refused when it is read."""
+    """Write a log; InputError of its source where reading it would fail."""
     try:
         write_log(log, out, check=True)
     except InputError as error:
@@ -116,23 +116,25 @@ def write_checked(log: Log, out: Path, source: Path) -> None:
 
 
 def report(notes: Counter[str], rule: LabelRule, log: Log) -> None:
-    """Print what the labels were taken for, what was left out or assumed how often, and the log in short."""
+    """Print the meaning of labels, what was dropped or assumed and how often, and a summary of the log."""
     say(*(f"{count} {text}" for text, count in notes.items() if count))
     measured = [] if log.measured is None else [measured_line(log.measured, scale_of(log))]
-    labels = [rule.told()] if rule.met else []
+    labels = [rule.summary()] if rule.met else []
     if hint := rule.hint():
         note(f"hint: {hint}")
     say(*labels, outline(log), *measured, describe(log))
 
 
 def outline(log: Log) -> str:
-    """Return in a line what a look at the log should show first: rates, speeds, ranges and labels."""
+    """One line about the log: rates, speeds, ranges and labels."""
     twists, seconds = log.odometry.twist, float(np.ptp(log.odometry.t))
     ranges = np.concatenate([np.hypot(*cycle.points_vehicle.T) for cycle in log.cycles])
     labels = np.bincount(np.concatenate([cycle.labels for cycle in log.cycles]), minlength=len(NAMES))
-    told = ", ".join(f"{count} {name}" for name, count in zip(NAMES, labels.tolist(), strict=True) if count)
+    counted = ", ".join(
+        f"{count} {name}" for name, count in zip(NAMES, labels.tolist(), strict=True) if count
+    )
     return (
         f"odometry at {rate(len(twists), seconds)}, up to {np.hypot(*twists[:, :2].T).max():.3g} m/s and "
         f"{np.abs(twists[:, 2]).max():.3g} rad/s; detections at {rate(len(log.cycles), seconds)}, "
-        f"{ranges.min():.3g} m to {ranges.max():.3g} m away: {told}"
+        f"{ranges.min():.3g} m to {ranges.max():.3g} m away: {counted}"
     )

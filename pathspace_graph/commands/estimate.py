@@ -1,4 +1,4 @@
-"""`online` and `batch`: a log is mapped cycle by cycle, without reading ahead, or optimized at once."""
+"""`online` and `batch`: map a log cycle by cycle, without reading ahead, or optimize it at once."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -83,12 +83,12 @@ def online_command(options: Online) -> Outcome:
 
 
 def plotting() -> Any:
-    """Return the module that draws maps; importing matplotlib is slow."""
+    """Import the module that draws maps; importing matplotlib is slow."""
     return import_module("pathspace_graph.commands.plot")
 
 
 def viewers(options: Online) -> Any:
-    """Return the module of viewers and films if one is asked for, which draws as well."""
+    """Import the module of viewers and films if one is requested, which draws as well."""
     asked = options.view or options.save_view is not None or options.animate is not None
     return import_module("pathspace_graph.eval.view.recording") if asked else None
 
@@ -119,7 +119,7 @@ def own_parameters(options: Online | Batch) -> Any:
 
 
 def begin(options: Online, log: Log, parameters: Any = None) -> tuple[Log, OnlineEstimator]:
-    """Return a new estimator and the log, or the saved mapper and the cycles that it has not seen."""
+    """Make an estimator for the log, or restore the saved mapper for the cycles that it has not seen."""
     if options.resume is None:
         return log, estimators.make_online(options.estimator, options.settings, log, parameters)
     mapper = FixedLagMapper.restore(options.resume)
@@ -132,7 +132,7 @@ def begin(options: Online, log: Log, parameters: Any = None) -> tuple[Log, Onlin
 
 
 def known_track(options: Online) -> KnownTrack | None:
-    """Return the known map that is asked for; SettingsError where options contradict each other."""
+    """Read the requested known map; SettingsError where options contradict each other."""
     if options.on is None:
         for option, is_given in (("start", options.start is not None), ("keep-map", options.keep_map)):
             if is_given:
@@ -142,13 +142,11 @@ def known_track(options: Online) -> KnownTrack | None:
         raise SettingsError(f"--on: expected --estimator {DEFAULT_ONLINE}, found {options.estimator}")
     if options.resume is not None:
         raise SettingsError("--on: expected no --resume, since a saved mapper has its own map")
-    if not 0.0 < options.map_sigma < np.inf:
-        raise SettingsError(f"--map-sigma: expected a positive number, found {options.map_sigma:g}")
     return read_known_map(options.on, options.map_sigma, options.settings)
 
 
 def begin_on(options: Online, known: KnownTrack, log: Log) -> tuple[Log, FixedLagMapper]:
-    """Return a mapper on a known map, and the log without its truth, which is in another frame."""
+    """Make a mapper on a known map; the log loses its truth, which is in another frame."""
     settings = estimators.settings_of(options.settings, log)
     start = known.start if options.start is None else np.array(options.start)
     mapper = FixedLagMapper.on(known.map, settings, log.noise, start=start, keep=options.keep_map)
@@ -204,7 +202,7 @@ def spline_batch(settings: MapperSettings, log: Log) -> BatchMapper:
 
 
 def untrusted(result: BatchRun) -> list[str]:
-    """Return what is wrong with the result of a batch."""
+    """What is wrong with the result of a batch."""
     known, wrong = result if isinstance(result, BatchResult) else None, list[str]()
     if not result.converged:
         reason = known.convergence.reason if known else "associations still change"
@@ -214,7 +212,7 @@ def untrusted(result: BatchRun) -> list[str]:
 
 
 def unique_names(folders: Sequence[Path]) -> dict[str, Path]:
-    """Return folders by their names, of which one that is there already gets a number."""
+    """Folders by their names; a repeated name gets a number."""
     named = dict[str, Path]()
     for folder in folders:
         name = folder.resolve().name
@@ -224,7 +222,7 @@ def unique_names(folders: Sequence[Path]) -> dict[str, Path]:
 
 
 def summary_of_drives(joint: JointResult, logs: Mapping[str, Log]) -> dict[str, Any]:
-    """Return what is known of each drive of a joint map, with truth in the drive's own frame."""
+    """What is known of each drive of a joint map, with truth in the drive's own frame."""
     drives = dict[str, Any]()
     shown = ("lap_count", "noise", "calibration", "final", "ate", "inside_two_sigma")
     for name, result in joint.drives.items():
@@ -234,7 +232,7 @@ def summary_of_drives(joint: JointResult, logs: Mapping[str, Log]) -> dict[str, 
 
 
 def drive_lines(joint: JointResult) -> list[str]:
-    """Return a line for each drive of a joint map."""
+    """A line for each drive of a joint map."""
     lines = []
     for name, result in joint.drives.items():
         x, y, heading = joint.frames[name].tolist()
@@ -244,7 +242,7 @@ def drive_lines(joint: JointResult) -> list[str]:
 
 
 def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
-    """Return a result with maps of this kind; where no line fits, the boundaries stay, as an error says."""
+    """Convert the maps of a result to this kind; where no line fits, note it and keep the boundaries."""
     if kind == "boundaries":
         return result
 
@@ -268,7 +266,7 @@ def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
 
 
 def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
-    """Return the summary of a run, how its optimization began and ended, and its gap from an online start."""
+    """Summary of a run, how its optimization began and ended, and its gap from an online start."""
     start = "odometry" if isinstance(result, BatchResult) and result.online is None else "online"
     summary = summarize(result, log, hints) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
@@ -279,7 +277,7 @@ def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> d
 
 
 def tell(hints: Sequence[Hint], of: str = "") -> None:
-    """Print a line for each hint as an error, with the name of the log `of` which it is, if given."""
+    """Print a line for each hint on standard error, with the name of its log, if given."""
     note(*(f"hint: {of}{'/' if of else ''}{hint.line}" for hint in hints))
 
 
@@ -294,7 +292,7 @@ def map_online(
 
 
 def report(result: RunResult, log: Log) -> None:
-    """Print the run, the paper's table where there is truth, and as an error what was not mapped."""
+    """Print the run, the paper's table where there is truth, and on standard error what was not mapped."""
     if laps := laps_of(result, log):
         output().print(laps_table(laps))
     say(outline(result), *kind_lines(result))
@@ -310,7 +308,7 @@ def report(result: RunResult, log: Log) -> None:
 
 
 def kind_lines(result: RunResult) -> list[str]:
-    """Return a line on the kind of the sensor, where it isn't of cones, or not known."""
+    """One line about the kind of the sensor, unless it sees cones."""
     if "kind" not in result.settings:
         return []
     words = {"line": "on both sides", "line-left": "on the left", "line-right": "on the right"}
@@ -323,7 +321,7 @@ def kind_lines(result: RunResult) -> list[str]:
 
 
 def outline(result: RunResult) -> str:
-    """Return the run in one line."""
+    """Summary of the run in one line."""
     laps = f"{result.laps} lap{'' if result.laps == 1 else 's'}"
     loop = "loop closed" if result.map.closed else "loop not closed"
     sizes = [f"{NAMES[label]} {boundary.size}" for label, boundary in sorted(result.map.boundaries.items())]
@@ -335,7 +333,7 @@ def outline(result: RunResult) -> str:
 
 
 def health_outline(result: RunResult) -> list[str]:
-    """Return how many cycles were not good, and why the vehicle is lost at the end, if any were."""
+    """Share of cycles that were not good, and why the vehicle is lost at the end."""
     number = counts([summary.health_of(record) for record in result.cycles])
     total = max(len(result.cycles), 1)
     reasons = Counter(record.reason for record in result.cycles if record.health == DEGRADED)
@@ -352,7 +350,7 @@ def health_outline(result: RunResult) -> list[str]:
 
 
 def laps_table(laps: list[LapMetrics]) -> Table:
-    """Return the paper's Table 1 with a row for each lap."""
+    """The paper's Table 1 with a row for each lap."""
     table = Table()
     for name in ("lap", "rmse [m]", "missed [%]", "size"):
         table.add_column(Text(name), justify="right")  # a plain text would be markup, in which [m] is a style

@@ -29,24 +29,24 @@ class KnownTrack:
     start: Array | None  # pose (3,) at the begin of an open one (m, m, rad), map frame; None of a closed one
 
     def found_at(self, estimator: OnlineEstimator) -> float | None:
-        """Return the stamp (s) at which the vehicle was found on the map, if it was."""
+        """Stamp (s) at which the vehicle was found on the map, if it was."""
         return estimator.placed_at if isinstance(estimator, FixedLagMapper) else None
 
     def differences(self, result: RunResult, estimator: OnlineEstimator) -> list[MapDifference]:
-        """Return where the track is no longer as it was known, once the vehicle was found on it."""
+        """Changes of the track against the known map, once the vehicle was found on it."""
         if self.found_at(estimator) is None:
             return []
         found = differences(scaled(self.map, 1.0 / result.scale), result.at_scale_one().map)
         return [scaled(one, result.scale) for one in found]
 
     def summary(self, estimator: OnlineEstimator, differ: list[MapDifference]) -> dict[str, Any]:
-        """Return what `summary.json` says about the map."""
+        """Entries of `summary.json` about the map."""
         known = {"map": str(self.path), "found_at": self.found_at(estimator)}
         return {"known_map": known, "differences": [asdict(one) for one in differ]}
 
 
 def read_known_map(path: Path, sigma: float, settings: MapperSettings) -> KnownTrack:
-    """Return the map of a folder, of a track file, or of an event of the rules.
+    """Read the map of a folder, of a track file, or of an event of the rules.
 
     Cones of a track file or of an event are known with a standard deviation `sigma` (m).
     """

@@ -1,4 +1,4 @@
-"""`compare` of two maps: one is laid on the other, and how far they are apart is told, written and drawn."""
+"""`compare` of two maps: align one with the other; print, write and draw their distances."""
 
 from pathlib import Path
 from typing import Final
@@ -22,7 +22,7 @@ STATISTICS: Final = ("mean", "rms", "p95", "max")
 
 
 def compare_maps(first: Path, second: Path, out: Path) -> Outcome:
-    """Lay the first map on the second, print how far they are apart, and write it with a picture."""
+    """Align the first map with the second, print and write their distances, and draw both."""
     check_target(out, APART_FILE)
     tracks = read_map(first), read_map(second)
     apart = maps_apart(*tracks)
@@ -38,7 +38,7 @@ def compare_maps(first: Path, second: Path, out: Path) -> Outcome:
 
 
 def apart_table(apart: MapsApart) -> Table:
-    """Return the distances of both boundaries together, and of each."""
+    """Distances of both boundaries together, and of each."""
     table = Table()
     table.add_column("boundary")
     for name in STATISTICS:

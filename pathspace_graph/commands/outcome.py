@@ -1,4 +1,4 @@
-"""What a command leaves: files, a summary for `--json`, and what is wrong with a result that is written."""
+"""Outcome of a command: its files, a summary for `--json`, and objections to the result."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -16,10 +16,10 @@ class Outcome:
 
     written: Sequence[Path]
     summary: Mapping[str, Any] = field(default_factory=dict)
-    wrong: Sequence[str] = ()  # a line each, and exit code 3; empty for a result that can be trusted
+    wrong: Sequence[str] = ()  # a line each, and exit code 3; empty for a trustworthy result
 
     def show(self, *, as_json: bool) -> None:
-        """Print the summary as JSON, or where the files are; and as errors what is wrong."""
+        """Print the summary as JSON, or the paths of the files; objections go to standard error."""
         files = [path for path in self.written if path.is_file() or path.is_dir()]  # no pipe or terminal
         if as_json and (files or self.summary):
             content = to_plain({**self.summary, "written": files, "wrong": self.wrong})

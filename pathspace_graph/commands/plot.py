@@ -3,10 +3,7 @@
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from pathspace_graph.console import say
-from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import check_plot_file, save_plot
 from pathspace_graph.frames import read_cycles
@@ -26,8 +23,6 @@ SUMMARY_FILE: Final = "summary.json"
 
 def plot_command(options: Plot) -> Outcome:
     check_picture(options.out)
-    if not 0.0 < options.band_scale < np.inf:
-        raise SettingsError(f"--band-scale: expected a positive number, found {options.band_scale}")
     track = read_map(options.map)
     log = None if options.log is None else read_log(options.log)
     files = (options.map / name for name in (TRAJECTORY_FILE, SMOOTHED_FILE))
@@ -47,7 +42,7 @@ def check_picture(file: Path) -> None:
 
 
 def _differences(file: Path) -> list[tuple[float, float]]:
-    """Return the places (m) at which a map differs from the one that was known, by its summary."""
+    """Places (m) at which a map differs from the one that was known, by its summary."""
     summary = read_json(file, "a summary") if file.exists() else {}
     return [(one["x"], one["y"]) for one in summary.get("differences", [])]
 

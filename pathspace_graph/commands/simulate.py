@@ -35,14 +35,14 @@ def _track(options: Simulate) -> Track:
 
 
 def generated_track(seed: int, settings: TrackGeneratorSettings | None = None) -> Track:
-    """Return the generated track of a seed."""
+    """Generated track of a seed."""
     if seed < 0:
         raise SettingsError(f"seed of a generated track: expected at least 0, found {seed}")
     return generate_track(np.random.default_rng(seed), settings)
 
 
 def describe(log: Log) -> str:
-    """Return the length of the log in words."""
+    """Length of the log in words."""
     detections = sum(len(cycle.labels) for cycle in log.cycles)
     seconds = log.odometry.t[-1] - log.odometry.t[0]
     return f"{seconds:.1f} s, {len(log.cycles)} perception cycles, {detections} detections"

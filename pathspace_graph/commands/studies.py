@@ -48,7 +48,7 @@ def execute(
 
 
 def with_drives(study: Study, given: StudyCommand) -> Study:
-    """Return the study with the tracks (files, or seeds of generated ones), logs, seeds and laps given."""
+    """Replace tracks (files, or seeds of generated ones), logs, seeds and laps of a study."""
     if given.laps is not None and given.laps < 1:
         raise SettingsError(f"--laps: expected at least 1, found {given.laps}")
     tracks = tuple(int(track) if track.isdecimal() else Path(track) for track in given.tracks)

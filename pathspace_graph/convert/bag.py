@@ -20,7 +20,7 @@ from .recording import Recording, check_clock, rate, twists_between
 from .settings import BagOptions, LabelRule
 
 INSTALL: Final = "pip install -e '.[ros]'"  # command that installs the package that reads bags
-SUPPORTED: Final = {  # what a message must hold, by the option of its topic
+SUPPORTED: Final = {  # contents that a message must have, by the option of its topic
     "--odometry": "a twist, a speed or a pose",
     "--imu": "an angular velocity",
     "--detections": "a point cloud, a scan, an array of markers, or a list of cones or polylines",
@@ -41,19 +41,19 @@ LONGEST_MAGIC: Final = max(map(len, RECOVERED))
 STATIC: Final = "/tf_static"  # topic of the transforms between frames that are fixed to the vehicle
 BODIES: Final = ("base_link", "base_footprint")  # frames of a vehicle whose odometry names none
 LEVEL: Final = 0.98  # least cosine of a level sensor's z axis and the vehicle's
-LATE: Final = 0.1  # median time (s) of receipt after or before the stamps that is worth a word
+LATE: Final = 0.1  # median delay (s) of receipt from which a note is made
 
 
 class Samples(NamedTuple):
-    """What was taken of the messages of one topic, in the order of the bag."""
+    """Values from the messages of one topic, in the order of the bag."""
 
     name: str  # topic and type of the messages
     t: Array  # (N,) stamps (s)
-    values: list[Any]  # what was taken of each message
+    values: list[Any]  # one for each message
 
 
 class Motion(NamedTuple):
-    """What a message says of the vehicle's motion."""
+    """Motion of the vehicle in a message."""
 
     twist: Array | None  # (3,) twist in m/s, m/s and rad/s, NaN where it is not known
     pose: Array | None  # (3,) pose in m, m and rad
@@ -62,7 +62,7 @@ class Motion(NamedTuple):
 
 
 def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool = False) -> Recording:
-    """Return what the topics of a bag have of a drive; `mounted` says that the sensor's pose was stated."""
+    """Read the drive in the topics of a bag; `mounted` says that the sensor's pose was stated."""
     notes: Counter[str] = Counter()
 
     def motion(message: Any) -> Motion:
@@ -91,12 +91,12 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
 def _mounting(
     odometry: Samples, detections: Samples, static: list[Any], notes: Counter[str], path: Path
 ) -> tuple[float, float, float] | None:
-    """Return the pose of the sensor by the bag's transforms; detections in the world's frame are refused."""
+    """Find the sensor's pose in the bag's transforms; refuse detections in the world's frame."""
     first, frames = odometry.values[0], {frame for frame, _ in detections.values} - {""}
     if first.pose is not None and first.body and first.world in frames - {first.body}:
         expected = f"expected detections in a frame of the vehicle, such as {first.body}"
         found = f"found them in {first.world}, the frame of its pose"
-        otherwise = "if they are in the vehicle's for all that, --mounting 0 0 0 says so"
+        otherwise = "--mounting 0 0 0 takes them as in the vehicle frame"
         raise InputError(path, f"{detections.name}: {expected}, {found}; {otherwise}")
     named = {one.header.frame_id.lstrip("/") for one in static}
     body = first.body or next((name for name in BODIES if name in named), "")
@@ -109,13 +109,13 @@ def _mounting(
         told = f"which {STATIC} puts at {x:.3g} {y:.3g} {yaw:.3g} (m, m, rad) in {body}"
         notes[f"messages with detections are in frame {others[0]}, {told}"] += len(detections.values)
         return float(x), float(y), float(yaw)
-    told = f"in frame {', '.join(others)}, the odometry is of {body}: --mounting says where the sensor is"
+    told = f"in frame {', '.join(others)}, the odometry is of {body}: --mounting states where the sensor is"
     notes[f"messages with detections are {told}"] += len(detections.values)
     return None
 
 
 def transform_between(static: list[Any], body: str, sensor: str) -> Array | None:
-    """Return `body_T_sensor` (4, 4) by `TransformStamped`s between frames, None if nothing connects them."""
+    """`body_T_sensor` (4, 4) by `TransformStamped`s between frames, None if nothing connects them."""
     edges: dict[str, list[tuple[str, Array]]] = {}
     for one in static:
         parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
@@ -140,7 +140,7 @@ def transform_between(static: list[Any], body: str, sensor: str) -> Array | None
 def _twists(
     odometry: Samples, imu: Samples | None, options: BagOptions, notes: Counter[str], path: Path
 ) -> tuple[Array, Array]:
-    """Return the stamps (n,) in s and the twists (n, 3) of the vehicle."""
+    """Stamps (n,) in s and twists (n, 3) of the vehicle."""
     measured = [motion.twist for motion in odometry.values if motion.twist is not None]
     poses = np.array([motion.pose for motion in odometry.values if motion.pose is not None])
     whole = len(poses) == len(odometry.values)
@@ -170,7 +170,7 @@ def _twists(
 
 
 def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[Array, Array]:
-    """Return the twists in the time of an IMU with its mean yaw rate until the next of them."""
+    """Replace the yaw rate of the twists by the mean of an IMU until the next twist."""
     order, turn = np.argsort(t, kind="stable"), np.argsort(imu_t, kind="stable")
     turn = turn[np.isfinite(rates[turn])]
     t, twists, imu_t, rates = t[order], twists[order], imu_t[turn], rates[turn]
@@ -204,7 +204,7 @@ def opened(path: Path, options: BagOptions, notes: Counter[str]) -> "Iterator[Ba
         if mended:
             raise InputError(path, f"{DAMAGED} ({error}): {mended}") from None
         expected = "expected a ROS bag: a file .bag, .mcap or .db3, or a folder with metadata.yaml"
-        raise InputError(path, f"{expected} ({error}); --from says what else it is") from None
+        raise InputError(path, f"{expected} ({error}); --from states another kind") from None
     try:
         yield Bag(path, reader, definitions, options.received, notes)
     finally:
@@ -212,7 +212,7 @@ def opened(path: Path, options: BagOptions, notes: Counter[str]) -> "Iterator[Ba
 
 
 def way_to_mend(path: Path) -> str:
-    """Return the command that mends a recording that was cut off or compressed, empty where none is known."""
+    """Command that mends a recording that was cut off or compressed, empty where none is known."""
     if path.is_dir():
         inside = (file for file in sorted(path.iterdir()) if file.is_file() and file.name != METADATA)
         return next(filter(None, map(way_to_mend, inside)), "")
@@ -220,7 +220,7 @@ def way_to_mend(path: Path) -> str:
     recovered = quote(str(path.with_name(f"recovered{path.suffix}")))
     places = {"file": file, "inner": inner, "recovered": recovered}
     if path.suffix in DECOMPRESSED:
-        return f"{DECOMPRESSED[path.suffix].format(**places)} gives the bag, which is converted then"
+        return f"{DECOMPRESSED[path.suffix].format(**places)} gives the bag to convert"
     with path.open("rb") as stream:
         begin = stream.read(LONGEST_MAGIC)
     commands = [command for magic, command in RECOVERED.items() if begin.startswith(magic)]
@@ -233,12 +233,12 @@ class Bag:
 
     path: Path
     reader: Any
-    definitions: dict[str, Any]  # definitions of messages that were handed over
+    definitions: dict[str, Any]  # definitions of messages from the options
     received: bool  # take the times of receipt as stamps
     notes: Counter[str]
 
     def samples(self, topic: str | None, option: str, take: Callable[[Any], Any]) -> Samples:
-        """Return what to `take` of a topic's messages, with header stamps if most have one, or of receipt."""
+        """`take` the messages of a topic, with their header stamps if most have one, else of receipt."""
         connections = self._connections(topic)
         if not connections:
             found = "found none" if topic is None else f"found {topic}"
@@ -260,7 +260,7 @@ class Bag:
         return Samples(name, t, [values[k] for k in stamped])
 
     def transforms(self) -> list[Any]:
-        """Return the `TransformStamped`s between frames fixed to the vehicle, of which there may be none."""
+        """`TransformStamped`s between frames fixed to the vehicle, of which there may be none."""
         connections = self._connections(STATIC)
         if not connections:
             return []
@@ -283,7 +283,7 @@ class Bag:
     def _read(
         self, connections: list[Any], take: Callable[[Any], Any], option: str
     ) -> tuple[list[float], list[float | None], list[Any]]:
-        """Return the times of receipt, the stamps and what was taken of all messages of a topic."""
+        """Read the times of receipt, the stamps and what was taken of all messages of a topic."""
         store, kind = self._store(connections[0]), connections[0].msgtype
         decode = store.deserialize_ros1 if is_ros1(self.path) else store.deserialize_cdr
         received, stamps, values = list[float](), list[float | None](), list[Any]()
@@ -297,7 +297,7 @@ class Bag:
             raise
         except MessageError as error:
             where = f"{option} {connections[0].topic} ({kind})"
-            raise self._error(f"{where}: {error}; supported is what has {SUPPORTED[option]}") from None
+            raise self._error(f"{where}: {error}; supported are messages with {SUPPORTED[option]}") from None
         except Exception as error:
             where = f"message {len(values) + 1} of {connections[0].topic} ({kind})"
             raise InputError(self.path, f"{where}: expected one that can be read ({error})") from None
@@ -312,7 +312,7 @@ class Bag:
             raise InputError(self.path, f"{DAMAGED} ({error}): {way_to_mend(self.path)}") from None
 
     def _store(self, connection: Any) -> Any:
-        """Return the types of a topic: those of the bag, or else those handed over and those of ROS."""
+        """Types of a topic: those of the bag, else those of the options and of ROS."""
         *_, typesys = _rosbags()
         ros = typesys.Stores.ROS1_NOETIC if is_ros1(self.path) else typesys.Stores.ROS2_HUMBLE
         try:
@@ -324,17 +324,17 @@ class Bag:
         except Exception as error:
             found = f"found a type without a definition ({connection.msgtype}: {error})"
             expected = f"{connection.topic}: expected a known type"
-            raise InputError(self.path, f"{expected}, {found}; --definition hands one over") from None
+            raise InputError(self.path, f"{expected}, {found}; --definition provides one") from None
         return store
 
 
 def is_ros1(path: Path) -> bool:
-    """Return whether a bag is one of rosbag1: a file. A folder is a bag of rosbag2, whatever its name."""
+    """Whether a bag is one of rosbag1: a file. A folder is a bag of rosbag2, whatever its name."""
     return path.name.endswith((".bag", ".bag.active")) and not path.is_dir()
 
 
 def _types_of(connection: Any, typesys: Any) -> dict[str, Any]:
-    """Return the types that the bag itself defines for a topic; an old bag defines none."""
+    """Types that the bag defines for a topic; an old bag defines none."""
     text, form = connection.msgdef.data, connection.msgdef.format.name
     if form == "MSG":
         return dict(typesys.get_types_from_msg(text, connection.msgtype))

@@ -1,4 +1,4 @@
-"""Points of lines, kerbs or walls: at a spacing along their row, and of the side of the way driven."""
+"""Points of lines, kerbs or walls: evenly spaced, and labelled by their side of the driven path."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -17,20 +17,20 @@ from .messages import ALONE, Points
 from .settings import LEAST_SPACING, Frames
 
 SPACING_SHARE: Final = 0.15  # spacing by the median range, which has the size of the scene
-WALL_SAMPLES: Final = 1_000_000  # of the way driven
-WALL_STRETCH: Final = 2.0  # reach along the way, before and behind, by the range of a point
-WALL_FARTHEST: Final = 3.0  # of a point of a boundary from the way, by the distance of the median point
-NEXT_LINE: Final = 1.5  # distance of a polyline from the way by that of the nearest one on its side
+WALL_SAMPLES: Final = 1_000_000  # of the driven path
+WALL_STRETCH: Final = 2.0  # reach along the path, ahead and behind, in ranges of the point
+WALL_FARTHEST: Final = 3.0  # distance of a boundary point from the path, in distances of the median point
+NEXT_LINE: Final = 1.5  # distance of a polyline from the path, in distances of the nearest one on its side
 
 
 def are_lines(scans: list[Points], spacing: float | None) -> bool:
-    """Return whether a record has points of lines: it has a stated spacing, or no point that stands alone."""
+    """Whether a record has points of lines: a spacing is stated, or no point stands alone."""
     lines = np.concatenate([np.zeros(0, int), *(scan.lines for scan in scans)])
     return spacing is not None or bool(len(lines) and (lines != ALONE).all())
 
 
 def default_spacing(scans: list[Points]) -> float:
-    """Return the spacing (m) of a record that states none."""
+    """Spacing (m) of a record that states none."""
     points = np.concatenate([np.zeros((0, 2)), *(scan.points for scan in scans)])
     return max(SPACING_SHARE * float(np.median(np.hypot(*points.T))), LEAST_SPACING)
 
@@ -43,17 +43,17 @@ def lines_of(
     spacing: float | None,
     notes: Counter[str],
 ) -> list[Points]:
-    """Return scans at the stamps t (n,) in s with points at a spacing (m), each of a side of the way driven.
+    """Space the points of scans at the stamps t (n,) in s evenly (m), and label them by the driven path.
 
-    A point keeps the label that it has. What is farther from the way than a boundary is left out.
+    A label that a point has stays. Points farther from the path than a boundary are dropped.
     """
     spacing = spacing or default_spacing(scans)
     found = [along_lines(scan, spacing) for scan in scans]
     told = f"points of lines are {spacing:.2g} m apart (--spacing), of {count(scans)} that were recorded"
     notes[told] += count(found)
-    way = DrivenWay.of(odometry, 0.5 * spacing)
+    path = DrivenPath.of(odometry, 0.5 * spacing)
     places = [in_vehicle(scan.points, frames) for scan in found]
-    lateral = [way.lateral(float(at), points) for at, points in zip(t, places, strict=True)]
+    lateral = [path.lateral(float(at), points) for at, points in zip(t, places, strict=True)]
     kept = [nearest_lines(scan.lines, away) for scan, away in zip(found, lateral, strict=True)]
     limit = farthest(np.concatenate(lateral))
     result = []
@@ -62,7 +62,7 @@ def lines_of(
             [scan.labels != UNKNOWN, away > 0.0, away < 0.0], [scan.labels, LEFT, RIGHT], UNKNOWN
         )
         result.append(scan._replace(labels=labels).where(near & ~(np.abs(away) > limit)))
-    notes["points of lines were too far from the way driven, and were left out"] += count(found) - count(
+    notes["points of lines were too far from the driven path, and were left out"] += count(found) - count(
         result
     )
     return result
@@ -73,19 +73,19 @@ def count(scans: Iterable[Points]) -> int:
 
 
 def in_vehicle(points: Array, frames: Frames) -> Array:
-    """Return points (m, 2) of the sensor in the vehicle frame."""
+    """Transform points (m, 2) of the sensor to the vehicle frame."""
     x, y, yaw = frames.mounting or (0.0, 0.0, 0.0)
     return np.asarray((points * frames.sides) @ rotation(yaw).T + np.array([x, y]))
 
 
 def farthest(lateral: Array) -> float:
-    """Return the largest distance (m) of a boundary from the way, by all lateral distances (m,)."""
+    """Largest distance (m) of a boundary from the path, by all lateral distances (m,)."""
     known = np.abs(lateral[np.isfinite(lateral)])
     return WALL_FARTHEST * float(np.median(known)) if len(known) else np.inf
 
 
 def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
-    """Return which points (m,) are of the polylines nearest to the way on their side, or of none."""
+    """Which points (m,) are of the polylines nearest to the path on their side, or of none."""
     kept = np.ones(len(lines), bool)
     numbers = np.unique(lines[lines >= 0])
     middles = np.array([np.nanmedian(lateral[lines == line]) for line in numbers])
@@ -97,7 +97,7 @@ def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
 
 
 def along_lines(points: Points, spacing: float) -> Points:
-    """Return points at a spacing (m): polylines are interpolated, what is dense is thinned."""
+    """Interpolate polylines and thin dense points to a spacing (m)."""
     parts = [points.where(thinned(points.points, spacing, points.lines < 0))]
     for line in np.unique(points.lines[points.lines >= 0]):
         own = points.where(points.lines == line)
@@ -108,16 +108,16 @@ def along_lines(points: Points, spacing: float) -> Points:
 
 
 def resampled(vertices: Array, spacing: float) -> Array:
-    """Return the points (m, 2) of a polyline (n, 2) at each multiple of the spacing (m) along it."""
+    """Points (m, 2) of a polyline (n, 2) at each multiple of the spacing (m)."""
     s = np.append(0.0, np.cumsum(np.hypot(*np.diff(vertices, axis=0).T)))
     at = np.arange(0.0, s[-1] + 1e-9 * spacing, spacing)
     return np.column_stack([np.interp(at, s, vertices[:, 0]), np.interp(at, s, vertices[:, 1])])
 
 
 def thinned(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
-    """Return the indices of chosen points (m, 2) no two of which are nearer than the spacing (m).
+    """Indices of chosen points (m, 2) no two of which are nearer than the spacing (m).
 
-    They are taken by bearing: by range, the noise of the ranges would decide which of some points is kept.
+    They are chosen by bearing, since by range the noise of the ranges would choose.
     """
     left = np.flatnonzero(chosen)
     left = left[np.argsort(np.arctan2(points[left, 1], points[left, 0]), kind="stable")]
@@ -129,17 +129,17 @@ def thinned(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class DrivenWay:
-    """The way driven by dead reckoning from the pose at the first twist."""
+class DrivenPath:
+    """The path driven, by dead reckoning from the pose at the first twist."""
 
     t: Array  # (N,) stamps (s)
     poses: Array  # (N, 3) poses in m, m and rad
     s: Array  # (N,) path length (m)
-    points: Array  # (k, 2) points of the way, at even distances
+    points: Array  # (k, 2) points of the path, evenly spaced
     at: Array  # (k,) their path lengths (m)
 
     @classmethod
-    def of(cls, odometry: Odometry, step: float) -> "DrivenWay":
+    def of(cls, odometry: Odometry, step: float) -> "DrivenPath":
         moves = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
         poses = np.vstack([np.zeros(3), moves])
         s = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
@@ -149,23 +149,23 @@ class DrivenWay:
         return cls(odometry.t, poses, s, points, at)
 
     def lateral(self, t: float, points: Array) -> Array:
-        """Return the distances (m,) of points (m, 2) to the left of the way, seen in the vehicle frame at t.
+        """Distances (m,) of points (m, 2) to the left of the path, seen in the vehicle frame at t.
 
-        Each is measured on the stretch around the vehicle that is within its range, as the way may come near
-        again later. It is NaN of a point before the begin of the way or beyond its end.
+        Each is measured on the stretch around the vehicle within its range, since the path may return later.
+        A point before the beginning or beyond the end of the path has NaN.
         """
         x, y, heading, here = (np.interp(t, self.t, of) for of in (*self.poses.T, self.s))
         placed = points @ rotation(float(heading)).T + np.array([x, y])
         reach = WALL_STRETCH * np.hypot(*points.T)
         near = np.abs(self.at - here) <= reach.max(initial=0.0)
-        way, at = self.points[near], self.at[near]
-        if len(way) < 2:
+        path, at = self.points[near], self.at[near]
+        if len(path) < 2:
             return np.full(len(points), np.nan)
-        offset = placed[:, None] - way
+        offset = placed[:, None] - path
         distances = np.hypot(offset[..., 0], offset[..., 1])
         distances[np.abs(at - here) > reach[:, None]] = np.inf
         foot = distances.argmin(axis=1)
-        along, away = np.gradient(way, axis=0)[foot], offset[np.arange(len(foot)), foot]
+        along, away = np.gradient(path, axis=0)[foot], offset[np.arange(len(foot)), foot]
         side = np.sign(along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0])
         forward = (along * away).sum(axis=1)
         first, last = at[foot] == self.at[0], at[foot] == self.at[-1]

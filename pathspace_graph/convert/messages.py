@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.io.log import covariances_of
+from pathspace_graph.io.covariances import covariances_of
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
 from .settings import LABEL_FIELDS, NO_LABEL, LabelRule
@@ -35,8 +35,15 @@ class MessageError(PathspaceError):
     """A message is not of a kind that can be read; the text says what was expected and what was found."""
 
 
+# errors of a message or a line that cannot be read
+BROKEN: Final = (
+    *(MessageError, AttributeError, TypeError, ValueError),
+    *(IndexError, OverflowError, RecursionError),
+)
+
+
 def first_of(holder: Any, names: Iterable[str]) -> Any:
-    """Return the first of these fields that a message has, or None."""
+    """Value of the first of these fields that a message has, or None."""
     return next((getattr(holder, name) for name in names if hasattr(holder, name)), None)
 
 
@@ -50,7 +57,7 @@ class Points(NamedTuple):
 
     @classmethod
     def of(cls, points: Any, labels: Any, covariances: Any = None, lines: Any = ALONE) -> "Points":
-        """Return the points of arrays or lists, which may be empty."""
+        """Make the points of arrays or lists, which may be empty."""
         placed = np.array(points, dtype=float).reshape(-1, 2)
         covariances = np.full((len(placed), 2, 2), np.nan) if covariances is None else covariances
         covariances = np.array(covariances, float).reshape(-1, 2, 2)
@@ -66,14 +73,14 @@ class Points(NamedTuple):
 
 
 def header_of(message: Any) -> Any:
-    """Return the header of a message, of the first point of an array of markers, or None."""
+    """Header of a message, of the first point of an array of markers, or None."""
     if hasattr(message, "markers"):
         return next((marker.header for marker in _added(message.markers)), None)
     return getattr(message, "header", None)
 
 
 def stamp_of(message: Any) -> float | None:
-    """Return the stamp of a message's header (s), or None where it has none or the stamp is zero."""
+    """Stamp of a message's header (s), or None where it has none or the stamp is zero."""
     header = header_of(message)
     if header is None or (header.stamp.sec == 0 and header.stamp.nanosec == 0):
         return None
@@ -81,13 +88,13 @@ def stamp_of(message: Any) -> float | None:
 
 
 def frame_of(message: Any, name: str = "frame_id") -> str:
-    """Return the frame of a message by its header, or by this field of its own; empty where it has none."""
+    """Frame of a message by its header, or by this field of its own; empty where it has none."""
     frame = getattr(message, name, None) or getattr(header_of(message), name, "")
     return str(frame).lstrip("/")
 
 
 def twist_of(message: Any, wheelbase: float | None = None) -> Array | None:
-    """Return the twist [vx, vy, wz] (3,) of a message in m/s, m/s and rad/s, None of one with a pose alone.
+    """Twist [vx, vy, wz] (3,) of a message in m/s, m/s and rad/s, None of one with a pose alone.
 
     Of a speed alone, vy = 0 and wz is NaN, or `v tan(delta) / wheelbase` (m) with a steering angle delta.
     MessageError where there is no motion at all in the message.
@@ -109,7 +116,7 @@ def twist_of(message: Any, wheelbase: float | None = None) -> Array | None:
 
 
 def pose_of(message: Any) -> Array | None:
-    """Return the pose [x, y, yaw] (3,) of a message in m and rad, or None where it has none."""
+    """Pose [x, y, yaw] (3,) of a message in m and rad, or None where it has none."""
     pose = message
     while hasattr(pose, "pose"):
         pose = pose.pose
@@ -119,20 +126,20 @@ def pose_of(message: Any) -> Array | None:
 
 
 def yaw_rate_of(message: Any) -> float:
-    """Return the yaw rate of an `Imu` (rad/s), whose z axis points up."""
+    """Yaw rate of an `Imu` (rad/s), whose z axis points up."""
     if not hasattr(message, "angular_velocity"):
         raise MessageError(f"expected a message with an angular_velocity, found {_names(message)}")
     return float(message.angular_velocity.z)
 
 
 def yaw_of(quaternion: Any) -> float:
-    """Return the yaw of a quaternion with x, y, z and w (rad)."""
+    """Yaw of a quaternion with x, y, z and w (rad)."""
     x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     return float(np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z))
 
 
 def points_of(message: Any, rule: LabelRule) -> Points:
-    """Return the points of a scan, a cloud, an array of markers, or lists of cones, polylines or numbers."""
+    """Points of a scan, a cloud, an array of markers, or lists of cones, polylines or numbers."""
     if hasattr(message, "angle_increment"):
         return scan_points(message)
     if hasattr(message, "point_step"):
@@ -145,7 +152,7 @@ def points_of(message: Any, rule: LabelRule) -> Points:
 
 
 def scan_points(scan: Any) -> Points:
-    """Return the points that the beams of a `LaserScan` have hit, without labels.
+    """Points that the beams of a `LaserScan` have hit, without labels.
 
     The range is NaN, infinite, or out of its limits where a beam has hit nothing.
     """
@@ -157,7 +164,7 @@ def scan_points(scan: Any) -> Points:
 
 
 def cloud_points(cloud: Any, rule: LabelRule) -> Points:
-    """Return the points of a `PointCloud2` by its fields `x`, `y`, the label and, if any, xx, xy, yy."""
+    """Points of a `PointCloud2` by its fields `x`, `y`, the label and, if any, xx, xy, yy."""
     columns, covariances = _cloud_columns(cloud), None
     points = np.column_stack([columns["x"], columns["y"]])
     if {"xx", "xy", "yy"} <= columns.keys():
@@ -197,7 +204,7 @@ def _cloud_columns(cloud: Any) -> dict[str, NDArray[Any]]:
 
 
 def array_points(message: Any, rule: LabelRule) -> Points:
-    """Return the points of a message with an array for each of `x`, `y` and, if it has one, the label."""
+    """Points of a message with an array for each of `x`, `y` and, if it has one, the label."""
     names = ["x", "y", *[name for name in rule.fields if hasattr(message, name)][:1]]
     x, y, *values = (np.atleast_1d(getattr(message, name)) for name in names)
     lengths = [len(x), len(y), *map(len, values)]
@@ -208,7 +215,7 @@ def array_points(message: Any, rule: LabelRule) -> Points:
 
 
 def marker_points(array: Any, rule: LabelRule) -> Points:
-    """Return the points of a `MarkerArray` that are added: blue ones are left, yellow ones right.
+    """Points of a `MarkerArray` that are added: blue ones are left, yellow ones right.
 
     A strip of lines is a polyline.
     """
@@ -239,7 +246,7 @@ def _of_marker(marker: Any, rule: LabelRule) -> Iterator[tuple[float, float, int
 
 
 def cone_points(message: Any, rule: LabelRule) -> Points:
-    """Return the cones in all lists of a message, as in `ConeArrayWithCovariance` and `Detection3DArray`.
+    """Cones in all lists of a message, as in `ConeArrayWithCovariance` and `Detection3DArray`.
 
     A list whose name has a word of `LIST_NAMES` in it gives all its cones that label. In other lists a cone
     has its own. Its covariance has 4 (x, y), 9 (x, y, z) or 36 entries (a pose), row by row. What has a list
@@ -274,27 +281,39 @@ def _path(cone: Any) -> Iterator[Any]:
 
 
 def _vertices(line: Any) -> list[tuple[float, float]] | None:
-    """Return the vertices (m) of a polyline: arrays x and y, or a list of points. None of a single point."""
+    """Vertices (m) of a polyline: arrays x and y, or a list of points. None of a single point."""
     if np.ndim(getattr(line, "x", 0.0)) and np.ndim(getattr(line, "y", 0.0)):
         return [(float(x), float(y)) for x, y in zip(line.x, line.y, strict=True)]
-    if any(hasattr(at, "x") and hasattr(at, "y") for at in _path(line)):
+    if any(map(_place, _path(line))):
         return None
-    lists = [getattr(line, name) for name in _names(line)]
+    lists = [getattr(line, name) for name in _names(line) if name != "covariance"]
     points = next((listed for listed in lists if _is_list(listed)), None)
     return None if points is None else [*map(_position, points)]
 
 
 def _position(cone: Any) -> tuple[float, float]:
-    """Return the position of a cone (m), which may lie some fields deep, as in a pose with covariance."""
-    at = next((at for at in _path(cone) if hasattr(at, "x") and hasattr(at, "y")), None)
-    if at is None:
-        fields_of_one = ", ".join(POSITIONS)
-        raise MessageError(f"expected a cone with one of the fields {fields_of_one}, found {_names(cone)}")
-    return float(at.x), float(at.y)
+    """Position of a cone (m), which may lie some fields deep, as in a pose with covariance."""
+    place = next(filter(None, map(_place, _path(cone))), None)
+    if place is None:
+        expected = f"x and y, range and bearing, or one of {', '.join(POSITIONS)}"
+        raise MessageError(f"expected a cone with the fields {expected}, found {_names(cone)}")
+    return place
+
+
+def _place(at: Any) -> tuple[float, float] | None:
+    """Position (m) of a pair, or of what has x and y, or range and bearing; None of anything else."""
+    if isinstance(at, list | tuple):
+        x, y = at
+        return float(x), float(y)
+    if hasattr(at, "x") and hasattr(at, "y"):
+        return float(at.x), float(at.y)
+    if hasattr(at, "range") and hasattr(at, "bearing"):
+        return float(at.range * np.cos(at.bearing)), float(at.range * np.sin(at.bearing))
+    return None
 
 
 def _covariance(cone: Any) -> Array:
-    """Return the covariance (2, 2) of a cone's position (m^2), which is NaN where it has none."""
+    """Covariance (2, 2) of a cone's position (m^2), which is NaN where it has none."""
     holder = next((at for at in _path(cone) if hasattr(at, "covariance")), None)
     entries = np.zeros(0) if holder is None else np.asarray(holder.covariance, dtype=float).ravel()
     side = {4: 2, 9: 3, 36: 6}.get(len(entries))
@@ -310,7 +329,7 @@ def _cone_label(name: str, cone: Any, rule: LabelRule) -> int:
 
 
 def _label_value(holder: Any, names: Sequence[str]) -> Any:
-    """Return the value of the first label field, also inside the first of several hypotheses."""
+    """Value of the first label field, also inside the first of several hypotheses."""
     value = first_of(holder, names)
     if _is_list(value):
         value = value[0] if value else None

@@ -1,4 +1,4 @@
-"""A record in any order as a log, and arriving messages as cycles; what was left out is counted."""
+"""Convert a record in any order to a log, and arriving messages to cycles; count what is dropped."""
 
 from bisect import insort
 from collections import Counter, deque
@@ -11,21 +11,22 @@ from typing import Any, Final
 import gtsam
 import numpy as np
 
-from pathspace_graph.errors import InputError, PathspaceError
+from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io import log as logs
+from pathspace_graph.io.covariances import is_positive_definite, ray_covariances
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_SPEED, MAX_STAMP, MAX_YAW_RATE
 
 from .lines import along_lines, are_lines, count, default_spacing, in_vehicle, lines_of
-from .messages import ALONE, DENSE, Points, points_of, stamp_of, twist_of
+from .messages import ALONE, BROKEN, DENSE, Points, points_of, stamp_of, twist_of
 from .settings import Frames, LabelRule, NoiseSettings, Window
 
 MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
 MAX_DISORDER: Final = 2.0  # largest fall of stamps (s) from one message to the next of one clock
-SHORTEST: Final = 1e-6  # time (s) in which nothing has a rate; a bag of one message has 1 ns
-PAUSE: Final = 1.0  # time (s) that is counted where a clock was reset
+SHORTEST: Final = 1e-6  # least time (s) that gives a rate; a bag of one message has 1 ns
+PAUSE: Final = 1.0  # time (s) assumed to pass where a clock was reset
 # notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
@@ -34,31 +35,31 @@ SHARED: Final = "messages with detections are at most 1 ms after another one, an
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What a record has of a drive, in its own order and its own frames."""
+    """Drive as it was recorded, in its own order and frames."""
 
     t: Array  # (N,) stamps of the twists (s)
     twists: Array  # (N, 3) twists in m/s, m/s and rad/s
     scan_t: Array  # (M,) stamps of the messages with detections (s)
-    scans: list[Points]  # detections of each message, in the frame of the sensor
-    source: dict[str, str]  # where the record comes from, in words
-    notes: Counter[str] = field(default_factory=Counter)  # what was done, in words, with the number of times
+    scans: list[Points]  # detections of each message, sensor frame
+    source: dict[str, str]  # origin of the record, in words
+    notes: Counter[str] = field(default_factory=Counter)  # what was done, in words, and how often
     mounting: tuple[float, float, float] | None = None  # sensor's pose (m, m, rad), where it is stated
 
 
 def twists_between(t: Array, poses: Array) -> Array:
-    """Return the constant twists (n - 1, 3) that lead from each pose (n, 3) at t (n,) in s to the next."""
+    """Constant twists (n - 1, 3) that lead from each pose (n, 3) at t (n,) in s to the next."""
     moves = [relative(one, other) for one, other in pairwise(poses)]
     logarithms = np.array([gtsam.Pose2.Logmap(gtsam.Pose2(*move)) for move in moves]).reshape(-1, 3)
     return logarithms / np.diff(t)[:, None]
 
 
 def rate(count: int, seconds: float) -> str:
-    """Return in words how often something came in a time (s), which may be none."""
+    """Rate of something in words, unknown where no time (s) passed."""
     return f"{count / seconds:.3g} Hz" if count > 1 and seconds > SHORTEST else "an unknown rate"
 
 
 def clock_falls(t: Array) -> Array:
-    """Return by how much each stamp (n,) in s falls where the clock was reset; elsewhere 0.
+    """Fall of each stamp (n,) in s where the clock was reset; elsewhere 0.
 
     Two messages before it and two from it on agree, unlike those of a stray stamp. Messages out of order fall
     by less than `MAX_DISORDER`.
@@ -73,13 +74,13 @@ def clock_falls(t: Array) -> Array:
 
 
 def elapsed(t: Array) -> Array:
-    """Return stamps (n,) in s of a clock that goes on by `PAUSE` where this one falls."""
+    """Stamps (n,) in s of a clock that advances by `PAUSE` where this one falls."""
     falls = clock_falls(t)
     return np.asarray(t + np.cumsum(falls + PAUSE * (falls > 0.0)))
 
 
 def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None, begin: float = 0.0) -> None:
-    """Raise an InputError where stamps (n,) in s fall back between `chosen` messages, with a way out.
+    """Raise an InputError where stamps (n,) in s fall back between `chosen` messages.
 
     The options `--start` and `--end` count from `begin` (s) on, as `elapsed` does.
     """
@@ -93,17 +94,19 @@ def check_clock(t: Array, what: str, file: Path, chosen: BoolArray | None = None
     fall = f"the stamps fall back by {t[before] - t[at]:.3g} s at message {at + 1}"
     found = f"found that {fall}, from {t[before]:.12g} s to {t[at]:.12g} s: was the clock reset?"
     parts = f"--end {cut:.1f} takes what is before, --start {cut:.1f} what is after it"
-    way_out = f"{parts}, and --received the times at which the messages of a bag were received"
+    way_out = f"{parts}; --received takes the times of receipt"
     raise InputError(file, f"expected {what} by one clock, {found} {way_out}")
 
 
 def windowed(record: Recording, window: Window, file: Path) -> Recording:
-    """Return the part of a record that counts."""
+    """Cut a record to the window."""
     notes, record = record.notes, _near(record, window.range_max, record.notes)
     scan_t = record.scan_t + window.time_offset
     clocks = elapsed(record.t), elapsed(scan_t)
     begin = float(np.nanmin(clocks[0], initial=np.inf))
-    is_cut = window.start > 0.0 or window.end < np.inf  # else stamps that are not finite stay to be counted
+    is_cut = (
+        window.start > 0.0 or window.end < np.inf
+    )  # else keep stamps that are not finite, which are counted later
     kept, seen = (
         (t >= begin + window.start) & (t <= begin + window.end) if is_cut else np.ones(len(t), bool)
         for t in clocks
@@ -118,7 +121,7 @@ def windowed(record: Recording, window: Window, file: Path) -> Recording:
 
 
 def _near(record: Recording, most: float | None, notes: Counter[str]) -> Recording:
-    """Return a record without detections farther than `most` from the sensor (m), if it is given."""
+    """Drop detections farther than `most` from the sensor (m), if it is given."""
     if most is None:
         return record
     with np.errstate(over="ignore"):
@@ -131,9 +134,9 @@ def _near(record: Recording, most: float | None, notes: Counter[str]) -> Recordi
 def to_log(
     record: Recording, frames: Frames, noise: NoiseSettings, file: Path, spacing: float | None = None
 ) -> Log:
-    """Return a record in order of time, in the vehicle frame; InputError of `file` if nothing is usable.
+    """Convert a record to a log; InputError of `file` if nothing is usable.
 
-    Points of lines are a spacing (m) apart, by default one that they tell themselves.
+    Points of lines are a spacing (m) apart, by default a share of their median range.
     """
     frames = replace(frames, mounting=frames.mounting or record.mounting)
     odometry = _odometry(record, frames, file)
@@ -157,7 +160,7 @@ def _with_lines(record: Recording, odometry: Odometry, frames: Frames, spacing: 
 
 
 def _without_lines(record: Recording) -> Recording:
-    """Return a record of points that stand alone, without polylines beside them."""
+    """Drop polylines beside points that stand alone."""
     scans = [scan.where(scan.lines == ALONE) for scan in record.scans]
     notes, left_out = record.notes, count(record.scans) - count(scans)
     notes["points of polylines beside cones were left out (--spacing takes both as lines)"] += left_out
@@ -257,7 +260,7 @@ def usable(points: Points, notes: Counter[str]) -> Points:
 def in_vehicle_frame(
     t: float, found: Points, frames: Frames, noise: NoiseSettings, notes: Counter[str]
 ) -> Detections:
-    """Return detections as a perception cycle in the vehicle frame.
+    """Make a perception cycle of detections, in the vehicle frame.
 
     A point `q` with covariance `K` is at `R(yaw) q + (x, y)` with `R K R^T`. Where a covariance is missing or
     not positive definite, it is made from range and bearing at the sensor.
@@ -265,7 +268,7 @@ def in_vehicle_frame(
     covariances = found.covariances * np.outer(frames.sides, frames.sides)
     known = positive_definite(covariances) & (not noise.replace_covariances)
     notes[ASSUMED] += int((~known).sum())
-    assumed = logs.ray_covariances(found.points * frames.sides, noise.sigmas)
+    assumed = ray_covariances(found.points * frames.sides, noise.sigmas)
     covariances = np.where(known[:, None, None], covariances, assumed)
     turn = rotation((frames.mounting or (0.0, 0.0, 0.0))[2])
     turned = turn @ covariances @ turn.T
@@ -274,25 +277,22 @@ def in_vehicle_frame(
 
 
 def positive_definite(covariances: Array) -> BoolArray:
-    """Return which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
+    """Which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
     xx, xy, yx, yy = covariances.reshape(-1, 4).T
     with np.errstate(over="ignore", invalid="ignore"):
-        good = np.isfinite(covariances).all(axis=(1, 2)) & logs.is_positive_definite(xx, xy, yy)
+        good = np.isfinite(covariances).all(axis=(1, 2)) & is_positive_definite(xx, xy, yy)
         good &= np.abs(xy - yx) <= MAX_ASYMMETRY * np.maximum(xx, yy)
         good &= np.maximum(xx, yy) < MAX_RANGE**2
     return np.asarray(good)
 
 
-MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle, the newest ones
-# errors of a message that cannot be read
-BROKEN: Final = (PathspaceError, AttributeError, TypeError, ValueError, IndexError, OverflowError)
+MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle
 
 
 class MessageStream:
     """Buffer of messages, which gives cycles in order, each with its twists; refused ones are counted.
 
-    A cycle waits for older ones until a message is newer by `wait` (s), as an estimator takes none that is
-    late.
+    A cycle waits for older ones until a message is newer by `wait` (s), since estimators refuse late ones.
     """
 
     def __init__(self, frames: Frames | None = None, wait: float = 0.0) -> None:
@@ -343,6 +343,6 @@ class MessageStream:
         return Odometry(np.array([stamp for stamp, _ in rows]), twists), cycle
 
     def use(self, t: float) -> None:
-        """Drop the twists that a cycle at t (s) has used, but for the last one, which is held."""
+        """Drop the twists that a cycle at t (s) has used, except the last one, which is held."""
         while len(self._twists) > 1 and self._twists[1][0] <= t:
             self._twists.popleft()

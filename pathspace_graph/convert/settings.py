@@ -1,4 +1,4 @@
-"""What a record does not say of itself: noise, where the sensor is mounted, and which way y points."""
+"""What a record does not state: noise, the mounting of the sensor, and the direction of y."""
 
 import re
 from collections import Counter
@@ -6,34 +6,35 @@ from collections.abc import Sequence
 from colorsys import rgb_to_hsv
 from dataclasses import dataclass
 from math import inf, isfinite, pi
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.errors import SettingsError, check_numbers
-from pathspace_graph.io.log import SIGMA_DETECTIONS
+from pathspace_graph.errors import SettingsError
+from pathspace_graph.io.covariances import SIGMA_DETECTIONS
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
+from pathspace_graph.settings.checked import AT_LEAST_0, POSITIVE, AtLeast0, Checked, Signed, Unlimited
 
 Side = Literal["left", "right"]  # side of the x axis to which the y axis points
 # fields of a message that may hold the label of a detection, the first one that is there
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
-NO_LABEL: Final = "none"  # name of a label field that says there are no labels
+NO_LABEL: Final = "none"  # name of a label field that means no labels
 LEAST_SPACING: Final = 1e-3  # of points along a line (m)
-DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers where nothing else is said
+DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers by default
 SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
 ORANGE_WORDS: Final = {"orange", "o"}
 BIG_WORDS: Final = {"big", "large"}
 # words of values that mean no side, and of colours, whose hue has decided
 UNKNOWN_WORDS: Final = {"unknown", "none", "other", "undefined", "uncolored", "colourless", "colour"}
-MOST_TOLD: Final = 12  # number of values of labels that a line lists
+MOST_SHOWN: Final = 12  # number of label values in a line
 HUES: Final = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)}  # in degrees
 MIN_SATURATION: Final = 0.3  # least saturation of a colour that is not grey
 
 
 @dataclass(frozen=True)
 class BagOptions:
-    """Which messages of a bag are taken, and how."""
+    """Which messages of a bag are read, and how."""
 
     odometry: str | None = None
     """Topic of the odometry in a bag: any message with a twist, with a speed (then --imu or --wheelbase gives
@@ -52,34 +53,26 @@ class BagOptions:
     from_poses: bool = False
     """Make the twists from the poses of the odometry, for a publisher that leaves its twist zero."""
     received: bool = False
-    """Take the times at which messages were received as stamps, also where they have one of their own."""
+    """Use the times of receipt as stamps, even where messages have their own."""
 
 
 @dataclass(frozen=True)
-class NoiseSettings:
+class NoiseSettings(Checked, group=""):
     """Noise of a record that does not state it."""
 
-    sigma_odometry: tuple[float, float, float] | None = None
+    sigma_odometry: Annotated[tuple[float, float, float] | None, POSITIVE] = None
     """Each sample of [vx, vy, wz] has these standard deviations (m/s, m/s, rad/s), white from sample to
     sample. Without them they are 0.25, 0.12 and 0.035, or what a data set states of itself. The covariance in
-    a message is not used, since it mostly is that of a filter's state, which is not white."""
+    a message is not used: mostly it is that of a filter's state, which is not white."""
     sigma_range: float | None = None
     """Standard deviation of the range at range 0 (m) of a detection without a covariance. Where none of these
     three is stated, they are measured, and without enough cones 0.05, 0.012 and 0.0157."""
-    sigma_range_growth: float | None = None
+    sigma_range_growth: Annotated[float | None, AT_LEAST_0] = None
     """Growth of the standard deviation of the range with the range (m/m)."""
     sigma_bearing: float | None = None
     """Standard deviation of the bearing (rad) of a detection without a covariance."""
     replace_covariances: bool = False
     """All detections have the covariance by these standard deviations, also where the record has another."""
-
-    def __post_init__(self) -> None:
-        sigmas = self.sigma_odometry
-        if sigmas is not None and (len(sigmas) != 3 or not all(0 < sigma < inf for sigma in sigmas)):
-            raise SettingsError(f"--sigma-odometry: expected three positive numbers, found {sigmas}")
-        for name in ("sigma_range", "sigma_bearing", "sigma_range_growth"):
-            expected = "a number of at least 0" if name == "sigma_range_growth" else "a positive number"
-            check_numbers(self, "convert", [name] if getattr(self, name) is not None else [], expected)
 
     @property
     def _own(self) -> tuple[float | None, ...]:
@@ -87,21 +80,21 @@ class NoiseSettings:
 
     @property
     def sigmas(self) -> tuple[float, ...]:
-        """Return sigmas of the range at range 0 (m), of its growth (m/m), and of the bearing (rad)."""
+        """Sigmas of the range at range 0 (m), of its growth (m/m), and of the bearing (rad)."""
         pairs = zip(self._own, SIGMA_DETECTIONS, strict=True)
         return tuple(default if own is None else own for own, default in pairs)
 
     @property
     def states_detections(self) -> bool:
-        """Return whether the noise of the detections is stated here."""
+        """Whether the noise of the detections is stated here."""
         return any(own is not None for own in self._own)
 
 
 @dataclass(frozen=True)
-class Frames:
+class Frames(Checked, group=""):
     """Frames in which odometry and detections were recorded."""
 
-    mounting: tuple[float, float, float] | None = None
+    mounting: Annotated[tuple[float, float, float] | None, "a number"] = None
     """Pose X Y YAW (m, m, rad) of the sensor in the vehicle frame: x forward, y left, yaw counterclockwise.
     Without it that of a bag's /tf_static is used, where there is one."""
     y: Side = "left"
@@ -111,50 +104,44 @@ class Frames:
     """Side to which the y axis of the odometry points, where it is another one than `y`."""
 
     def __post_init__(self) -> None:
-        mounting = self.mounting or (0.0, 0.0, 0.0)
-        if not all(map(isfinite, mounting)) or abs(mounting[2]) > 2.0 * pi:
-            expected = "--mounting: expected X Y YAW in m, m and rad, with a yaw of at most 2 pi"
-            raise SettingsError(f"{expected}, found {' '.join(f'{value:g}' for value in mounting)}")
+        super().__post_init__()
+        if self.mounting and abs(self.mounting[2]) > 2.0 * pi:
+            raise SettingsError(f"mounting: expected a yaw of at most 2 pi rad, found {self.mounting[2]:g}")
 
     @property
     def sides(self) -> NDArray[np.float64]:
-        """Return by what a point [x, y] (2,) of the sensor is multiplied, so that y points to the left."""
+        """Signs (2,) of a sensor's point [x, y] that make y point to the left."""
         return np.array([1.0, 1.0 if self.y == "left" else -1.0])
 
     @property
     def flip(self) -> NDArray[np.float64]:
-        """Return by what a twist [vx, vy, wz] (3,) is multiplied, so that its y axis points to the left."""
+        """Signs (3,) of a twist [vx, vy, wz] that make its y axis point to the left."""
         return np.array([1.0, 1.0, 1.0] if (self.y_odometry or self.y) == "left" else [1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
-class Window:
-    """Which part of a record counts, and when its detections were measured."""
+class Window(Checked, group=""):
+    """Part of a record to convert, and correction of its stamps."""
 
     range_max: float | None = None
-    """Largest distance from the sensor of a detection that counts (m)."""
-    time_offset: float = 0.0
-    """Time (s) that is added to the stamps of the detections: negative where they are too late."""
-    start: float = 0.0
+    """Largest distance of a detection from the sensor (m); farther ones are dropped."""
+    time_offset: Signed = 0.0
+    """Time (s) added to the stamps of the detections: negative where they are too late."""
+    start: AtLeast0 = 0.0
     """Time after the first odometry at which the log begins (s)."""
-    end: float = inf
+    end: Unlimited = inf
     """Time after the first odometry at which the log ends (s)."""
     spacing: float | None = None
     """Distance of points along a line, a kerb or a wall (m), to which dense ones are thinned and polylines
-    interpolated. It says that all detections are of lines. Without it those of a LaserScan and of polylines
+    interpolated. It means that all detections are of lines. Without it those of a LaserScan and of polylines
     are, at 0.15 of their median range."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.start < self.end:
-            found = f"found {self.start:g} and {self.end:g}"
-            raise SettingsError(f"--start, --end: expected times of at least 0 in this order, {found}")
-        if self.range_max is not None and not 0.0 < self.range_max < inf:
-            raise SettingsError(f"--range-max: expected a positive number, found {self.range_max:g}")
-        if self.spacing is not None and not LEAST_SPACING <= self.spacing < inf:
-            expected = f"--spacing: expected at least {LEAST_SPACING:g} m"
-            raise SettingsError(f"{expected}, found {self.spacing:g}")
-        if not isfinite(self.time_offset):
-            raise SettingsError(f"--time-offset: expected a number, found {self.time_offset:g}")
+        super().__post_init__()
+        if self.start >= self.end:
+            raise SettingsError(f"start: expected less than end, found {self.start:g} and {self.end:g}")
+        if self.spacing is not None and self.spacing < LEAST_SPACING:
+            raise SettingsError(f"spacing: expected at least {LEAST_SPACING:g} m, found {self.spacing:g}")
 
 
 class LabelRule:
@@ -175,7 +162,7 @@ class LabelRule:
             self._labels[value] = NAMES.index(name)
 
     def of(self, value: Any, times: int = 1) -> int:
-        """Return the label of a value met so often: a number, a text, or a colour with `r`, `g` and `b`."""
+        """Label a value that was met so often: a number, a text, or a colour with `r`, `g` and `b`."""
         value = getattr(value, "data", value)
         if hasattr(value, "r") and hasattr(value, "g") and hasattr(value, "b"):
             r, g, b = (float(channel) for channel in (value.r, value.g, value.b))
@@ -190,22 +177,22 @@ class LabelRule:
         texts, place, counts = np.unique(values, return_inverse=True, return_counts=True)
         return np.array([*map(self.of, texts.tolist(), counts.tolist())], dtype=int)[place]
 
-    def told(self) -> str:
-        """Return in a line what the most frequent values were taken for; empty where there are none."""
-        most = self.met.most_common(MOST_TOLD)
+    def summary(self) -> str:
+        """One line with the labels of the most frequent values; empty where there are none."""
+        most = self.met.most_common(MOST_SHOWN)
         values = [f"{text or 'empty'} is {NAMES[label]} ({count})" for (text, label), count in most]
         return f"labels: {', '.join(values)}{', ...' * (len(self.met) > len(most))}" if values else ""
 
     def hint(self) -> str:
-        """Return which values may mean a side that nobody has said; empty where there are none."""
+        """Hint at values that may mean a side; empty where there are none."""
         unknown = [text for (text, label), _ in self.met.most_common() if label == UNKNOWN]
         unmapped = [text for text in unknown if label_words(text).isdisjoint(UNKNOWN_WORDS) and text]
-        told = f"labels {', '.join(unmapped[:MOST_TOLD])} are taken for unknown"
-        return f"{told}: --labels left={unmapped[0]} says what they mean" if unmapped else ""
+        told = f"labels {', '.join(unmapped[:MOST_SHOWN])} are read as unknown"
+        return f"{told}: --labels left={unmapped[0]} gives them a meaning" if unmapped else ""
 
 
 def _whole(text: str) -> str:
-    """Return the text of a whole number as `1`, also where it is written as `1.0`; else the text."""
+    """Text of a whole number as `1`, also where it is written as `1.0`; else the text."""
     try:
         number = float(text)
     except ValueError:
@@ -214,12 +201,12 @@ def _whole(text: str) -> str:
 
 
 def label_words(text: str) -> set[str]:
-    """Return the words of a text in lower case: those of `Blue-cone` are blue and cone."""
+    """Words of a text in lower case: those of `Blue-cone` are blue and cone."""
     return set(re.findall(r"[a-z]+", text.lower()))
 
 
 def label_of_words(text: str) -> int:
-    """Return the label of a text by its words; UNKNOWN where none or several are of a side."""
+    """Label of a text by its words; UNKNOWN where none or several are of a side."""
     words = label_words(text)
     if words & ORANGE_WORDS:
         return BIG_ORANGE if words & BIG_WORDS else ORANGE
@@ -228,7 +215,7 @@ def label_of_words(text: str) -> int:
 
 
 def label_of_colour(red: float, green: float, blue: float) -> int:
-    """Return the label of a blue, yellow or orange colour, UNKNOWN of any other; the scale is free."""
+    """Label of a blue, yellow or orange colour, UNKNOWN of any other; the scale is free."""
     most, least = max(red, green, blue), min(red, green, blue)
     if not 0.0 < most < inf or not most - least > MIN_SATURATION * most:
         return UNKNOWN

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -15,7 +15,7 @@ import numpy as np
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.log import covariances_of
+from pathspace_graph.io.covariances import covariances_of
 from pathspace_graph.io.parsing import (
     DELIMITERS,
     MAX_STAMP,
@@ -27,7 +27,7 @@ from pathspace_graph.io.parsing import (
 )
 from pathspace_graph.labels import UNKNOWN
 
-from .messages import ALONE, Points, scan_points
+from .messages import ALONE, BROKEN, Points, cone_points, scan_points
 from .recording import Recording
 from .settings import LabelRule
 
@@ -51,10 +51,8 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {  # units of each quantity, i
 MAX_BEARING: Final = 2.0 * pi  # largest bearing (rad); more are degrees
 LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are large
 _BEFORE_ZONE: Final = re.compile(r"\s+(?=(?:Z|[+-]\d\d(?::?\d\d)?)$)")  # blanks before Z or an offset
-_OTHER: Final = {"range": "bearing", "bearing": "range"}
-UNSTATED: Final = ((np.nan, np.nan), (np.nan, np.nan))  # covariance of a detection that states none
-MANY_ROWS: Final = 20  # number of rows whose nanoseconds tell that they are some
-LEAST_NANOSECONDS: Final = 1e6  # which the fractions of some seconds reach
+MANY_ROWS: Final = 20  # number of rows from which nanoseconds are checked
+LEAST_NANOSECONDS: Final = 1e6  # that fractions of so many rows reach
 MIN_PERIOD: Final = 1e-5  # least mean period of samples (s); less is a wrong unit of time
 MAX_PERIOD: Final = 1e3  # largest mean period of samples (s); more is a wrong unit of time
 
@@ -62,7 +60,7 @@ MAX_PERIOD: Final = 1e3  # largest mean period of samples (s); more is a wrong u
 def read_csv(
     odometry: Path, detections: Path, rule: LabelRule, columns: Sequence[str] = (), units: Sequence[str] = ()
 ) -> Recording:
-    """Return what two CSV files have of a drive; an InputError names file, row and column.
+    """Read the drive in two CSV files; an InputError names file, row and column.
 
     Quantities are in columns of their own names, unless `columns` says `vx=speed`, `y=-cone_y` or
     `odometry.t=stamp`, and in SI units, unless `units` says `length=mm angle=deg time=ns`. Stamps may be ISO
@@ -82,7 +80,7 @@ def read_csv(
 
 
 def _named(pairs: Sequence[str]) -> dict[tuple[str, str], str]:
-    """Return columns by kind of file and quantity, with a minus where the sign changes."""
+    """Columns by kind of file and quantity, with a minus where the sign changes."""
     named: dict[tuple[str, str], str] = {}
     for pair in pairs:
         key, equals, name = pair.partition("=")
@@ -96,7 +94,7 @@ def _named(pairs: Sequence[str]) -> dict[tuple[str, str], str]:
 
 
 def _units(pairs: Sequence[str]) -> dict[str, str]:
-    """Return the units of the quantities; those of a `speed` and a `yaw_rate` follow the others."""
+    """Units of the quantities; those of a `speed` and a `yaw_rate` follow the others."""
     names = {"time": "s", "length": "m", "angle": "rad"}
     for pair in pairs:
         quantity, equals, unit = pair.partition("=")
@@ -122,11 +120,11 @@ class _File:
             raise InputError(self.table.file, "expected at least one row, found a header only", 2)
 
     def has(self, key: str) -> bool:
-        """Return whether the file has the column of a quantity; one that was named must be there."""
+        """Whether the file has the column of a quantity; one that was named must be there."""
         return (self.kind, key) in self.named or key in self.table.columns
 
     def column(self, key: str, column: str = "") -> str:
-        """Return the column of a quantity, which must be there; it may be one of several `column`s."""
+        """Column of a quantity, which must be there; it may be one of several `column`s."""
         column = column or self.named.get((self.kind, key), key).removeprefix("-")
         if column not in self.table.columns:
             otherwise = f", or {key}=SECONDS+NANOSECONDS" * (key == "t")
@@ -136,14 +134,14 @@ class _File:
         return column
 
     def numbers(self, key: str, power: int = 1) -> Array:
-        """Return a column (rows,) in the SI unit or, for `power` 2, its square; NaN where it is missing."""
+        """A column (rows,) in the SI unit or, for `power` 2, its square; NaN where it is missing."""
         quantity = QUANTITIES[self.kind][key]
         sign = -1.0 if self.named.get((self.kind, key), "").startswith("-") else 1.0
         factor = sign * UNITS[quantity][self.units[quantity]] ** power
         return np.asarray(factor * self.table.numbers(self.column(key), LARGEST, missing=True))
 
     def stamps(self) -> Array:
-        """Return the stamps (rows,) in s: numbers, dates, or seconds and nanoseconds in two columns."""
+        """Stamps (rows,) in s: numbers, dates, or seconds and nanoseconds in two columns."""
         stated, unit = self.named.get((self.kind, "t"), "t"), self.units["time"]
         if "+" in stated and stated not in self.table.columns:
             return self._checked(self._in_two_columns(*stated.split("+", 1)), "s")
@@ -153,7 +151,7 @@ class _File:
         return self._checked(UNITS["time"][unit] * self.table.numbers(name, LARGEST), unit)
 
     def _in_two_columns(self, whole: str, fraction: str) -> Array:
-        """Return the stamps (rows,) in s of columns with seconds and with nanoseconds."""
+        """Stamps (rows,) in s of columns with seconds and with nanoseconds."""
         seconds, nanoseconds = (
             self.table.numbers(self.column("t", name), LARGEST) for name in (whole, fraction)
         )
@@ -173,7 +171,7 @@ class _File:
         return np.array(seconds, dtype=float)
 
     def _checked(self, t: Array, unit: str) -> Array:
-        """Return stamps (rows,) in s, which must be plausible where they were in this unit."""
+        """Stamps (rows,) in s, which must be plausible where they were in this unit."""
         name = self.named.get((self.kind, "t"), "t")
         self.table.require(
             np.abs(t) <= MAX_STAMP,
@@ -194,7 +192,7 @@ class _File:
 
 
 def seconds_of_date(text: str) -> float | None:
-    """Return the time (s) since 1970 of a date with a time by ISO 8601, UTC without an offset; else None."""
+    """Time (s) since 1970 of a date with a time by ISO 8601, UTC without an offset; else None."""
     text = _BEFORE_ZONE.sub("", text.strip().upper().replace("UTC", "Z"))
     if is_number(text):
         return None
@@ -206,7 +204,7 @@ def seconds_of_date(text: str) -> float | None:
 
 
 def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
-    """Return the stamps of the perception cycles (n,) in s, and the points of each, in the file's order."""
+    """Stamps of the perception cycles (n,) in s, and the points of each, in the file's order."""
     t, points, covariances = file.stamps(), _points(file), None
     labels = np.full(len(t), UNKNOWN)
     if any(map(file.has, COVARIANCE)):
@@ -226,7 +224,9 @@ def _points(file: _File) -> Array:
     if file.has("x") and (DETECTIONS, "range") not in file.named:
         return np.column_stack([file.numbers("x"), file.numbers("y")])
     if not (file.has("range") and file.has("bearing")):
-        raise _without_place(file)
+        expected = "expected the columns x and y, or range and bearing (--columns x=NAME)"
+        found = f"found the columns {', '.join(file.table.columns)}"
+        raise InputError(file.table.file, f"{expected}, {found}", 1)
     ranges, bearings = file.numbers("range"), file.numbers("bearing")
     name, unit = file.column("bearing"), file.units["angle"]
     file.table.require(
@@ -238,21 +238,12 @@ def _points(file: _File) -> Array:
     return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
 
 
-def _without_place(file: _File) -> InputError:
-    """Return the error of detections without x and y, and without range and bearing."""
-    polar = next((key for key in ("range", "bearing") if not file.has(key) and file.has(_OTHER[key])), "")
-    either = f"'{polar}' beside {_OTHER[polar]}, or x and y" if polar else "'x' and y, or range and bearing"
-    expected = f"expected a column {either} (--columns {polar or 'x'}=NAME)"
-    found = f"found the columns {', '.join(file.table.columns)}"
-    return InputError(file.table.file, f"{expected}, {found}", 1)
-
-
 def read_json_lines(file: Path, rule: LabelRule) -> Recording:
-    """Return what a file of JSON lines has of a drive, in SI units; an InputError names file and line.
+    """Read the drive in a file of JSON lines, in SI units; an InputError names file and line.
 
     A line is `{"t": s, "twist": [vx, vy, wz]}` or `{"t": s, "detections": [{"x": m, "y": m, "label": "blue",
-    "covariance": [[xx, xy], [xy, yy]]}, ...]}`, with `range` and `bearing` in place of `x` and `y` where one
-    likes; label and covariance are optional. A line may have both. In place of detections it may have
+    "covariance": [[xx, xy], [xy, yy]]}, ...]}`, or both. Label and covariance are optional, and `range` and
+    `bearing` may replace `x` and `y`. Instead of detections a line may have
     `"polylines": [{"points": [[x, y], ...], "label": "left"}, ...]` or a scan as of a `LaserScan`:
     `"scan": {"angle_min": rad, "angle_increment": rad, "range_min": m, "range_max": m, "ranges": [m, ...]}`.
     """
@@ -261,59 +252,27 @@ def read_json_lines(file: Path, rule: LabelRule) -> Recording:
         if not line.strip():
             continue
         try:
-            entry = json.loads(line)
-            stamp = float(entry["t"])
-            if "twist" in entry:
+            entry = json.loads(line, object_hook=lambda entries: SimpleNamespace(**entries))
+            stamp = float(entry.t)
+            if hasattr(entry, "twist"):
                 t.append(stamp)
-                twists.append(np.array(entry["twist"], dtype=float).reshape(3))
-            points = [read(entry[key], rule) for key, read in _READERS.items() if key in entry]
-            scan_t += [stamp] * len(points)
-            scans += points
-        except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
+                twists.append(np.array(entry.twist, dtype=float).reshape(3))
+            points = [*_points_of_line(entry, rule)]
+        except BROKEN as error:
             expected = "expected a line with t, and with twist [vx, vy, wz], detections, polylines or a scan"
             found = f"found {shown(line)} ({type(error).__name__}: {error})"
             raise InputError(file, f"{expected}, {found}", row) from None
+        scan_t += [stamp] * len(points)
+        scans += points
     measured = np.array(t), np.array(twists).reshape(-1, 3)
     return Recording(*measured, np.array(scan_t), scans, {"file": file.name})
 
 
-def _points_of_objects(objects: list[dict[str, Any]], rule: LabelRule) -> Points:
-    points, covariances, labels = [], [], []
-    for one in objects:
-        is_polar = "range" in one or "bearing" in one
-        place = np.array(
-            [one[key] for key in (("range", "bearing") if is_polar else ("x", "y"))], dtype=float
-        )
-        points.append(place[0] * np.array([np.cos(place[1]), np.sin(place[1])]) if is_polar else place)
-        covariances.append(np.array(one.get("covariance", UNSTATED), dtype=float).reshape(2, 2))
-        labels.append(rule.of(one["label"]) if "label" in one else UNKNOWN)
-    return Points.of(points, labels, covariances)
-
-
-def _points_of_polylines(polylines: list[dict[str, Any]], rule: LabelRule) -> Points:
-    points, labels, lines = [], [], []
-    for number, one in enumerate(polylines):
-        vertices = np.array(one["points"], dtype=float).reshape(-1, 2)
-        points.append(vertices)
-        labels += [rule.of(one["label"]) if "label" in one else UNKNOWN] * len(vertices)
-        lines += [number] * len(vertices)
-    return Points.of(np.concatenate([np.zeros((0, 2)), *points]), labels, lines=lines)
-
-
-def _points_of_scan(scan: dict[str, Any], rule: LabelRule) -> Points:
-    ranges = [np.nan if value is None else float(value) for value in scan["ranges"]]
-    fields = {key: float(scan[key]) for key in ("angle_min", "angle_increment")}
-    fields |= {
-        "range_min": float(scan.get("range_min", 0.0)),
-        "range_max": float(scan.get("range_max", np.inf)),
-    }
-    return scan_points(SimpleNamespace(ranges=ranges, **fields))
-
-
-_READERS: Final[
-    dict[str, Callable[[Any, LabelRule], Points]]
-] = {  # of what a line may have beside its stamp and a twist
-    "detections": _points_of_objects,
-    "polylines": _points_of_polylines,
-    "scan": _points_of_scan,
-}
+def _points_of_line(entry: SimpleNamespace, rule: LabelRule) -> Iterator[Points]:
+    """Yield the points of a line's lists and of its scan, each read as a message."""
+    for name in ("detections", "polylines"):
+        if hasattr(entry, name):
+            yield cone_points(SimpleNamespace(**{name: getattr(entry, name)}), rule)
+    if hasattr(entry, "scan"):
+        scan = SimpleNamespace(**{"range_min": 0.0, "range_max": np.inf, **vars(entry.scan)})
+        yield scan_points(scan)

@@ -1,4 +1,4 @@
-"""What a notebook shows of records: texts here; pictures and frames of rooms above, imported on demand."""
+"""Texts of records in a notebook; pictures and frames come from rooms above, imported on demand."""
 
 from dataclasses import fields, is_dataclass
 from importlib import import_module
@@ -23,7 +23,7 @@ class Brief:
 
 
 def brief(value: Any) -> str:
-    """Return a text of a value on one line, with shapes and lengths in place of many numbers."""
+    """One-line text of a value, with shapes and lengths in place of many numbers."""
     shape = getattr(value, "shape", None)
     if shape is not None and getattr(value, "size", 0) > LONGEST:
         return f"array {shape}"

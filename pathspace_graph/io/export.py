@@ -60,12 +60,12 @@ def write_points(file: Path, track: Map, step: float) -> None:
 
 
 def boundary_points(boundary: MapBoundary, step: float) -> Array:
-    """Return points (n, 2) of a boundary about `step` (m) apart along it, or its landmarks."""
+    """Points (n, 2) of a boundary about `step` (m) apart along it, or its landmarks."""
     return boundary.points if isinstance(boundary, PointBoundary) else sampled(boundary.spline, step)
 
 
 def sampled(spline: BSpline, step: float, fewest: int = _FEWEST_INTERVALS) -> Array:
-    """Return points (n, 2) of a curve about `step` (m) apart; the first of a closed one isn't repeated."""
+    """Points (n, 2) of a curve about `step` (m) apart; the first of a closed one isn't repeated."""
     length = spline.length()
     at = np.linspace(0.0, length, max(round(length / step), fewest) + 1)
     return spline.evaluate(spline.parameters_at(at[:-1] if spline.periodic else at))
@@ -99,7 +99,7 @@ class LocalPlane:
                 raise SettingsError(f"origin: expected a {expected} degrees, found {found:g}")
 
     def to_geodetic(self, points_map: Array) -> Array:
-        """Return latitude and longitude (n, 2), in degrees, of points (n, 2) of the map in m."""
+        """Latitude and longitude (n, 2), in degrees, of points (n, 2) of the map in m."""
         sine, cosine = np.sin(np.radians(self.heading)), np.cos(np.radians(self.heading))
         east, north = (points_map @ np.array([[sine, cosine], [-cosine, sine]])).T
         degrees = pymap3d.enu2geodetic(east, north, 0.0 * east, self.latitude, self.longitude, 0.0)
@@ -162,62 +162,64 @@ _FEWEST_WAY_INTERVALS: Final = 2
 _DECIMALS: Final = 5  # number of decimals of local coordinates (m)
 
 
+class _Osm:
+    """OSM XML that grows by nodes, ways and relations; each gets a number, and a version for readers."""
+
+    def __init__(self, plane: LocalPlane) -> None:
+        self.root = ET.Element("osm", version="0.6", generator="pathspace-graph")
+        self._plane, self._numbers = plane, count(1)
+
+    def add(self, kind: str, tags: dict[str, str], parts: list[ET.Element], **attributes: str) -> str:
+        """Add an element with its parts and tags, and return its number."""
+        shared = {"id": str(next(self._numbers)), "visible": "true", "version": "1"}
+        element = ET.SubElement(self.root, kind, shared | attributes)
+        element.extend([*parts, *(ET.Element("tag", k=key, v=value) for key, value in tags.items())])
+        return shared["id"]
+
+    def add_nodes(self, points: Array, tags: dict[str, str]) -> list[str]:
+        """Add a node for each point (n, 2) of the map, and return their numbers."""
+        nodes = []
+        for (x, y), degrees in zip(points.tolist(), self._plane.to_geodetic(points).tolist(), strict=True):
+            latitude, longitude = (f"{one:.{_DECIMALS_DEGREES}f}" for one in degrees)
+            place = {"local_x": f"{x:.{_DECIMALS}f}", "local_y": f"{y:.{_DECIMALS}f}", "ele": "0.0"}
+            nodes.append(self.add("node", place | tags, [], lat=latitude, lon=longitude))
+        return nodes
+
+
 def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> None:
     """Write both boundaries as ways of points `step` (m) apart, lanelets between them, and orange cones.
 
     Nodes of the OSM XML have latitude, longitude and, as tags, their place in the map frame. A loop is cut
     where normals of its centre line cross the boundaries; consecutive lanelets share their nodes there.
     """
-    root, numbers = ET.Element("osm", version="0.6", generator="pathspace-graph"), count(1)
-
-    def add(kind: str, **attributes: str) -> ET.Element:
-        """Add an element with its number; readers of OSM XML expect a version."""
-        shared = {"id": str(next(numbers)), "visible": "true", "version": "1"}
-        return ET.SubElement(root, kind, shared | attributes)
-
-    def add_tags(element: ET.Element, tags: dict[str, str]) -> None:
-        for key, value in tags.items():
-            ET.SubElement(element, "tag", k=key, v=value)
-
-    def add_nodes(points: Array, tags: dict[str, str]) -> list[str]:
-        nodes = []
-        for (x, y), degrees in zip(points.tolist(), plane.to_geodetic(points).tolist(), strict=True):
-            latitude, longitude = (f"{one:.{_DECIMALS_DEGREES}f}" for one in degrees)
-            nodes.append(add("node", lat=latitude, lon=longitude))
-            place = {"local_x": f"{x:.{_DECIMALS}f}", "local_y": f"{y:.{_DECIMALS}f}", "ele": "0.0"}
-            add_tags(nodes[-1], place | tags)
-        return [node.attrib["id"] for node in nodes]
-
-    def add_way(nodes: list[str]) -> str:
-        way = add("way")
-        for node in nodes:
-            ET.SubElement(way, "nd", ref=node)
-        add_tags(way, WAY_TAGS)
-        return way.attrib["id"]
-
+    osm = _Osm(plane)
     left, right = (boundary.spline for boundary in track.curves("lanelet2"))
-    closed = left.periodic
     line = find_line(left, right)
-    cuts = np.linspace(*line.ribbon.domain, _PIECES + 1)[: _PIECES if closed else 0]
-    ways = []
+    cuts = np.linspace(*line.ribbon.domain, _PIECES + 1)[: _PIECES if left.periodic else 0]
+    sides = []
     for spline, crossing in zip((left, right), line.crossings(cuts), strict=True):
-        pieces = [add_nodes(piece, {}) for piece in _pieces(spline, crossing.u, step)]
-        for piece, following in zip(pieces, pieces[1:] + pieces[:1] if closed else [], strict=False):
+        pieces = [osm.add_nodes(piece, {}) for piece in _pieces(spline, crossing.u, step)]
+        for piece, following in zip(pieces, pieces[1:] + pieces[:1] if left.periodic else [], strict=False):
             piece.append(following[0])
-        ways.append(pieces)
+        sides.append(pieces)
     for label, cones in sorted(track.points.items()):
-        add_nodes(cones.points, {"type": CONE, "subtype": NAMES[label]})
-    for pair in zip(*[[add_way(nodes) for nodes in pieces] for pieces in ways], strict=True):
-        relation = add("relation")
-        for label, way in zip(BOUNDARIES, pair, strict=True):
-            ET.SubElement(relation, "member", type="way", ref=way, role=NAMES[label])
-        add_tags(relation, LANELET_TAGS)
-    ET.indent(root)
-    ET.ElementTree(root).write(file, encoding="UTF-8", xml_declaration=True)
+        osm.add_nodes(cones.points, {"type": CONE, "subtype": NAMES[label]})
+    ways = [
+        [osm.add("way", WAY_TAGS, [ET.Element("nd", ref=node) for node in nodes]) for nodes in pieces]
+        for pieces in sides
+    ]
+    for pair in zip(*ways, strict=True):
+        members = [
+            ET.Element("member", type="way", ref=way, role=NAMES[label])
+            for label, way in zip(BOUNDARIES, pair, strict=True)
+        ]
+        osm.add("relation", LANELET_TAGS, members)
+    ET.indent(osm.root)
+    ET.ElementTree(osm.root).write(file, encoding="UTF-8", xml_declaration=True)
 
 
 def _pieces(spline: BSpline, cuts: Array, step: float) -> list[Array]:
-    """Return the points (n, 2) of each stretch between cuts, without its last one, or of an open curve."""
+    """Points (n, 2) of each stretch between cuts, without its last one, or of an open curve."""
     if not len(cuts):
         return [sampled(spline, step, _FEWEST_WAY_INTERVALS)]
     length, (low, high) = spline.length(), spline.domain

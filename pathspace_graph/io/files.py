@@ -32,8 +32,8 @@ STDOUT: Final = Path("-")  # path at which a single file is written to standard 
 def atomic_folder(target: Path | str, marker: str) -> Iterator[Path]:
     """Yield a temporary folder beside `target` that gets a manifest and takes its place on success.
 
-    An earlier result, known by the file `marker`, is kept as a numbered backup `NAME.~1~`; anything else but
-    an empty folder is an OutputError.
+    An earlier result, recognized by the file `marker`, is kept as a numbered backup `NAME.~1~`. Anything
+    else except an empty folder is an OutputError.
     """
     final = _followed(target)
     check_target(final, marker)
@@ -77,7 +77,7 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
 
 
 def is_stream(path: Path) -> bool:
-    """Return whether a path is standard output, a device or a pipe, which can't be replaced."""
+    """Whether a path is standard output, a device or a pipe, which can't be replaced."""
     return path == STDOUT or (path.exists() and not path.is_file() and not path.is_dir())
 
 
@@ -101,7 +101,7 @@ def write_text(file: Path, text: str) -> None:
 
 
 def to_plain(value: Any) -> Any:
-    """Return the value in the types of strict JSON; NaN becomes null, and infinity the text "inf"."""
+    """Convert a value to the types of strict JSON; NaN becomes null, and infinity the text "inf"."""
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
@@ -126,11 +126,11 @@ def remove_manifest(folder: Path) -> None:
     (folder / MANIFEST_FILE).unlink(missing_ok=True)
 
 
-# --- what is there -------------------------------------------------------------------------------------
+# --- checks of the target -------------------------------------------------------------------------------
 
 
 def check_target(target: Path | str, marker: str) -> None:
-    """Raise an OutputError where `atomic_folder` would lose something foreign at `target`, or fail."""
+    """Raise an OutputError where `atomic_folder` would lose foreign files at `target`, or fail."""
     if Path(target) == STDOUT:
         raise OutputError(f"{STDOUT}: expected a folder to write; only one file goes to standard output")
     target = _followed(target)
@@ -171,7 +171,7 @@ def _check_parents(target: Path) -> None:
 
 
 def _backup(final: Path) -> Path | None:
-    """Give what is at a path a numbered name: a folder has only that one then, a file has both."""
+    """Back up a path under a numbered name: a folder is renamed, a file is linked."""
     with suppress(OSError):
         final.rmdir()  # an empty folder is no result
     if not os.path.lexists(final):
@@ -187,12 +187,12 @@ def _backup(final: Path) -> Path | None:
     return backup
 
 
-# --- the way to the place ------------------------------------------------------------------------------
+# --- temporary paths ------------------------------------------------------------------------------------
 
 
 @contextmanager
 def _parents(final: Path) -> Iterator[None]:
-    """Make the folders above a path, which go again on failure; errors of the disk name the path."""
+    """Make the folders above a path, and remove them on failure; errors of the disk name the path."""
     missing = [parent for parent in final.parents if not parent.exists()]
     with _naming(final):
         try:
@@ -214,10 +214,10 @@ def _naming(final: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if any(map(is_temporary, final.parts)):
-            raise  # whoever writes the folder around it names that
+            raise  # the enclosing `atomic_folder` names its target
         named = Path(str(error.filename or final))
         if not any(map(is_temporary, named.parts)) and named not in (final, *final.parents):
-            raise  # of a file that is read
+            raise  # an error of reading
         raise OutputError(f"{final}: can't be written: {error.strerror or error}") from error
 
 
@@ -229,7 +229,7 @@ def is_temporary(name: str) -> bool:
 def _beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
     """Yield a new path beside `final`, made by `make` and locked, which is gone at the end.
 
-    Those that dead runs left there go as well: nobody has locked them.
+    Unlocked ones, which dead runs left there, are removed as well.
     """
     stem, suffix = re.escape(f".{final.stem}."), re.escape(f".tmp{final.suffix}")
     for path in final.parent.iterdir():
@@ -248,7 +248,7 @@ def _beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
 
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Lock a path, or raise an OSError where another living process has; the kernel ends a dead one's."""
+    """Lock a path; OSError where another process has locked it. Locks of dead processes end."""
     if fcntl is None:
         yield
         return

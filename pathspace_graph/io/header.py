@@ -1,110 +1,153 @@
-"""The header of a log: sections of texts and numbers in TOML, among them where its noise comes from."""
+"""The header of a log in TOML: sensor and source, the noise and where it comes from, and the true errors."""
 
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
+from msgspec import Meta, Struct, defstruct
+from msgspec.structs import asdict, astuple
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.labels import KINDS
 
-from .parsing import MAX_HEADER_BYTES, MAX_NOISE, parse_toml, read_text, shown
+from .parsing import MAX_HEADER_BYTES, MAX_NOISE, parse_toml, read_text, shown, typed
 
 FORMAT: Final = "pathspace-log/1"
-POSITIVE: Final = math.ulp(0.0)
 STATED: Final = "stated"
 UNSTATED: Final = ("measured", "assumed")  # measured, or assumed where the drive shows too little
-MEASURED: Final = "noise.measured"  # section, whose entries have so many numbers of at least so much
-_ODOMETRY: Final = {"odometry": (3, 0.0), "drift": (3, 0.0), "interval": (1, POSITIVE)}
-_SECONDS: Final = {"seconds": (1, 0.0)}
-_RAYS: Final = {"along": (4, 0.0), "across": (4, 0.0)}
-_DETECTIONS: Final = {
-    **_RAYS,
-    **{"count": (1, 1.0), "period": (1, POSITIVE), "per_cycle": (1, POSITIVE)},
-    **dict.fromkeys(SENSOR, (2, -MAX_NOISE)),
+CALIBRATION: Final = ("scale", "bias")  # constant errors of the odometry
+TRUE_ERRORS: Final = {  # entries of the truth, by the field of `io.log:Truth` that holds them
+    "calibration": CALIBRATION,
+    "sensor": SENSOR,
+    "noise": ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing", "slow_time"),
+    "bend": ("range_bend", "range_bend_from"),
+    "rays": ("sigma_range", "sigma_range_growth", "sigma_bearing"),
 }
-_BEND: Final = {"range_bend": (1, -MAX_NOISE)}  # beside these where ranges bend
+
+Number = Annotated[float, Meta(ge=-MAX_NOISE, le=MAX_NOISE)]
+AtLeast0 = Annotated[float, Meta(ge=0.0, le=MAX_NOISE)]
+Positive = Annotated[float, Meta(gt=0.0, le=MAX_NOISE)]
+Kind = Annotated[str, Meta(pattern=f"^({'|'.join(KINDS)})$")]
+Origin = Annotated[str, Meta(pattern=f"^({'|'.join((STATED, *UNSTATED))})$")]
+Ray = tuple[AtLeast0, AtLeast0, Annotated[float, Meta(ge=0.0, le=1.0)], Positive]  # fields of a `RayNoise`
+Error = tuple[Number, Positive]  # an error of the sensor and its sigma
 
 
-class Header:
-    """A header as it was read; whatever is wrong with an entry is an InputError that names it."""
-
-    def __init__(self, file: Path) -> None:
-        self.file = file
-        self._content = parse_toml(read_text(file, most=MAX_HEADER_BYTES), file)
-        if self._content.get("format") != FORMAT:
-            found = shown(self._content.get("format"))
-            raise InputError(file, f'expected format = "{FORMAT}", found {found}')
-
-    def section(self, path: str) -> dict[str, Any]:
-        """Return the section of a dotted name, which is empty where there is none."""
-        section = self._content
-        for name in path.split("."):
-            section = section.get(name, {})
-            if not isinstance(section, dict):
-                raise InputError(self.file, f"expected a section [{path}], found {shown(section)}")
-        return section
-
-    def numbers(self, path: str, name: str, count: int = 1, least: float = -MAX_NOISE) -> Array:
-        """Return an entry of `count` numbers (count,), each from `least` to MAX_NOISE."""
-        value = self.section(path).get(name)
-        values = value if isinstance(value, list) else [value]
-        if len(values) != count or not all(_is_number(one, least) for one in values):
-            bound = {-MAX_NOISE: "", POSITIVE: "positive "}.get(least)
-            what = f"{count} {bound or ''}number{'s' if count > 1 else ''}"
-            what += f" of at least {least:g}" if bound is None else ""
-            raise InputError(self.file, f"expected {what} as [{path}] {name}, found {shown(value)}")
-        return np.array(values, dtype=float)
-
-    def word(self, path: str, name: str, known: tuple[str, ...]) -> Any:
-        """Return an entry that is one of the known words, or None where there is none."""
-        value = self.section(path).get(name)
-        if value is None or value in known:
-            return value
-        quoted = [f'"{word}"' for word in known]
-        expected = f"expected {', '.join(quoted[:-1])} or {quoted[-1]} as [{path}] {name}"
-        raise InputError(self.file, f"{expected}, found {shown(value)}")
-
-    def noise(self) -> dict[str, Any]:
-        """Return the fields of a log about its noise; one without the section has stated it."""
-        found: dict[str, Any] = {}
-        for name in ("odometry", "detections"):
-            word = self.word("noise", name, (STATED, *UNSTATED))
-            found[f"{name}_stated"] = word in (None, STATED)
-        return found | {"measured": self._measured() if "measured" in self.section("noise") else None}
-
-    def _measured(self) -> MeasuredNoise:
-        entries = _ODOMETRY | (_DETECTIONS if "along" in self.section(MEASURED) else {}) | _SECONDS
-        entries |= _BEND if "range_bend" in self.section(MEASURED) else {}
-        values = {name: self.numbers(MEASURED, name, *expected) for name, expected in entries.items()}
-        noisy = values["odometry"] + values["drift"] > 0.0
-        self._require(noisy, "a twist with some noise as odometry or drift")
-        fields: dict[str, Any] = {name: values.pop(name) for name in ("odometry", "drift")}
-        if "along" in values:
-            for name in _RAYS:
-                near, growth, share, time = values.pop(name)
-                good = near + growth > 0.0 and share <= 1.0 and time > 0.0
-                self._require(good, f"some noise, a share of at most 1 and a positive time as {name}")
-                fields[name] = RayNoise(np.array([near, growth]), float(share), float(time))
-            sensor, sigma = np.array([values.pop(name) for name in SENSOR]).T
-            self._require(sigma > 0.0, "a positive sigma as the second number of each error of the sensor")
-            fields |= {"sensor": sensor, "sensor_sigma": sigma}
-            self._require(values["count"] % 1.0 == 0.0, "a whole number as count")
-            fields["count"] = int(values.pop("count").item())
-        return MeasuredNoise(**fields | {name: value.item() for name, value in values.items()})
-
-    def _require(self, good: Any, expected: str) -> None:
-        if not np.all(good):
-            raise InputError(self.file, f"[{MEASURED}]: expected {expected}")
+class _Odometry(Struct):
+    sigma: tuple[Positive, Positive, Positive]
 
 
-def _is_number(value: object, least: float) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= MAX_NOISE
+class _Sensor(Struct, frozen=True):
+    range_max: Positive | None = None
+    fov: Positive | None = None
+    rate: Positive | None = None
+    kind: Kind | None = None
+
+
+class _Measured(Struct, kw_only=True):
+    odometry: tuple[AtLeast0, AtLeast0, AtLeast0]
+    drift: tuple[AtLeast0, AtLeast0, AtLeast0]
+    interval: Positive
+    seconds: AtLeast0
+    range_bend: Number = 0.0
+
+
+class _MeasuredRays(_Measured, kw_only=True):
+    along: Ray
+    across: Ray
+    count: Annotated[int, Meta(ge=1)]
+    period: Positive
+    per_cycle: Positive
+    yaw: Error
+    lateral: Error
+    latency: Error
+    range_scale: Error
+    range_bias: Error
+
+
+class _Noise(Struct, frozen=True):
+    odometry: Origin = STATED
+    detections: Origin = STATED
+    measured: dict[str, Any] | None = None
+
+
+class Header(Struct):
+    """A header as it was read, without format."""
+
+    odometry: _Odometry
+    sensor: _Sensor = _Sensor()
+    noise: _Noise = _Noise()
+    source: dict[str, Any] = {}
+    truth: dict[str, Any] = {}
+
+
+_TRUTH: Final = {
+    name: defstruct(name, [(entry, Number) for entry in entries]) for name, entries in TRUE_ERRORS.items()
+}
+
+
+def read_header(file: Path) -> Header:
+    """Read the header of a log; an InputError names the file and the entry."""
+    content = parse_toml(read_text(file, most=MAX_HEADER_BYTES), file)
+    if content.get("format") != FORMAT:
+        raise InputError(file, f'expected format = "{FORMAT}", found {shown(content.get("format"))}')
+    return typed(content, Header, file)
+
+
+def true_errors(header: Header, file: Path) -> dict[str, Array]:
+    """Known true errors by the field of `Truth`; each group is whole, and a truth has a calibration."""
+    stated = header.truth
+    return {
+        name: np.array(astuple(typed(stated, _TRUTH[name], file, "truth")))
+        for name, entries in TRUE_ERRORS.items()
+        if stated and (name == "calibration" or not stated.keys().isdisjoint(entries))
+    }
+
+
+def measured_noise(header: Header, file: Path) -> MeasuredNoise | None:
+    stated, where = header.noise.measured, "noise.measured"
+    if stated is None:
+        return None
+    has_rays = "along" in stated
+    read = typed(stated, _MeasuredRays if has_rays else _Measured, file, where)
+    entries = asdict(read)
+    twist: dict[str, Any] = {name: np.array(entries.pop(name)) for name in ("odometry", "drift")}
+    if not np.all(twist["odometry"] + twist["drift"] > 0.0):
+        raise InputError(file, f"{where}: expected a twist with some noise as odometry or drift")
+    if has_rays:
+        for name in ("along", "across"):
+            near, growth, share, time = entries[name]
+            if not near + growth > 0.0:
+                raise InputError(file, f"{where}.{name}: expected some noise")
+            entries[name] = RayNoise(np.array([near, growth]), share, time)
+        errors, sigmas = np.array([entries.pop(name) for name in SENSOR]).T
+        entries |= {"sensor": errors, "sensor_sigma": sigmas}
+    return MeasuredNoise(**twist, **entries)
+
+
+def noise_sections(odometry: bool, detections: bool, measured: MeasuredNoise | None) -> dict[str, Any]:
+    """Sections of the noise, where not all of it is stated."""
+    if odometry and detections and measured is None:
+        return {}
+    has_rays = measured is not None and measured.along is not None
+    section = {
+        "odometry": STATED if odometry else UNSTATED[measured is None],
+        "detections": STATED if detections else UNSTATED[not has_rays],
+    }
+    if measured is None:
+        return {"noise": section}
+    errors = np.column_stack([measured.sensor, measured.sensor_sigma])
+    values = vars(measured) | dict(zip(SENSOR, errors, strict=True))
+    for name in ("along", "across") if has_rays else ():
+        values[name] = [*values[name].sigma, values[name].share, values[name].time]
+    entries = (_MeasuredRays if has_rays else _Measured).__struct_fields__
+    names = [name for name in entries if name != "range_bend" or measured.range_bend]
+    return {"noise": section, "noise.measured": {name: values[name] for name in names}}
 
 
 def to_toml(sections: Mapping[str, Mapping[str, Any]]) -> str:
@@ -116,26 +159,8 @@ def to_toml(sections: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def toml_text(value: Any) -> str:
-    """Return a text, a number or a list of numbers as TOML."""
+    """A text, a number or an array of numbers as TOML."""
     if not isinstance(value, str):
-        return repr(value)
+        return repr(np.asarray(value).tolist())
     # a JSON string is a TOML string, but for the delete character
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def noise_sections(odometry: bool, detections: bool, measured: MeasuredNoise | None) -> dict[str, Any]:
-    if odometry and detections and measured is None:
-        return {}
-    rays = measured is not None and measured.along is not None
-    section = {
-        "odometry": STATED if odometry else UNSTATED[measured is None],
-        "detections": STATED if detections else UNSTATED[not rays],
-    }
-    if measured is None:
-        return {"noise": section}
-    errors = np.column_stack([measured.sensor, measured.sensor_sigma])
-    values = vars(measured) | dict(zip(SENSOR, errors, strict=True))
-    for name in _RAYS if rays else ():
-        values[name] = [*values[name].sigma, values[name].share, values[name].time]
-    entries = [*_ODOMETRY, *(_DETECTIONS if rays else ()), *_SECONDS, *(_BEND if measured.range_bend else ())]
-    return {"noise": section, MEASURED: {name: np.asarray(values[name]).tolist() for name in entries}}

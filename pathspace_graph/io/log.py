@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
+from msgspec.structs import asdict
 from numpy.typing import ArrayLike
 
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
-from pathspace_graph.labels import KINDS, NAMES, UNKNOWN, Kind, label_from_name
+from pathspace_graph.labels import NAMES, UNKNOWN, Kind, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS
 
+from . import header as headers
 from . import parsing as limits
 from .brief import Brief, pictures
+from .covariances import SIGMA_DETECTIONS, covariances_of, is_positive_definite, ray_covariances
 from .files import atomic_folder
-from .header import POSITIVE, Header, noise_sections, to_toml, toml_text
 from .parsing import Column, Table, read_table, write_table
 
 if TYPE_CHECKING:
@@ -53,27 +55,10 @@ COLUMNS: Final[dict[str, dict[str, Column]]] = {  # of each table, in the order 
 TRUTH_FILES: Final = (TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FILE)  # which are optional
 FILES: Final = (LOG_FILE, *COLUMNS)
 
-# entries of the truth in the header; the noise is there where it is not white as the log states it
-CALIBRATION: Final = ("scale", "bias")
-SENSOR: Final = ("yaw", "lateral", "latency", "range_scale", "range_bias")
-NOISE: Final = ("sigma_vx", "sigma_vy", "sigma_wz", "slow_range", "slow_bearing", "slow_time")
-BEND: Final = ("range_bend", "range_bend_from")
-RAYS: Final = ("sigma_range", "sigma_range_growth", "sigma_bearing")
-_TRUE_ERRORS: Final = {
-    "calibration": CALIBRATION,
-    "sensor": SENSOR,
-    "noise": NOISE,
-    "bend": BEND,
-    "rays": RAYS,
-}
-
 SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
-SIGMA_DETECTIONS: Final = (0.05, 0.012, np.pi / 200.0)  # (m, m/m, rad) where nothing is known
-MIN_RANGE_OF_BEARING: Final = 1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at 0
 MIN_INTERVAL: Final = 1e-3  # s between perception cycles; below, the odometry is too certain for doubles
 ROUND_OFF: Final = 1e-6  # s, of the difference of two stamps: doubles resolve those since 1970 to 2.4e-7 s
 MAX_HOLD: Final = 1.0  # s; a perception cycle later after the last twist has no odometry
-MIN_RELATIVE_DETERMINANT: Final = 1e-12  # least det over xx * yy: singular to double precision below
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -88,14 +73,14 @@ class Odometry(Brief):
     """Twists [vx, vy, wz] (N, 3) in m/s, m/s, rad/s, vehicle frame."""
 
     def between(self, start: float, end: float) -> Odometry:
-        """Return the twists in force from `start` (s) to `end` (s); before the first row nothing moves."""
+        """Twists in force from `start` (s) to `end` (s); before the first row nothing moves."""
         start = max(start, float(self.t[0]))
         first = int(np.searchsorted(self.t, start, side="right")) - 1
         stop = max(first, int(np.searchsorted(self.t, end, side="left"))) if end > start else first
         return Odometry(np.maximum(self.t[first:stop], start), self.twist[first:stop])
 
     def followed_by(self, later: Odometry) -> Odometry:
-        """Return these twists and the later ones that are newer."""
+        """Append the later twists that are newer."""
         new = later.t > self.t[-1] if len(self.t) else np.ones(len(later.t), bool)
         return Odometry(np.append(self.t, later.t[new]), np.concatenate([self.twist, later.twist[new]]))
 
@@ -121,9 +106,7 @@ class Detections(Brief):
         return Detections(self.t, self.points_vehicle[chosen], self.covariances[chosen], self.labels[chosen])
 
     def with_others(self, other: Detections) -> Detections:
-        """Return these detections followed by other ones of the same cycle."""
-        if len(other.labels) == 0:
-            return self
+        """Append other detections of the same cycle."""
         names = ("points_vehicle", "covariances", "labels")
         return Detections(
             self.t, *(np.concatenate([getattr(of, name) for of in (self, other)]) for name in names)
@@ -216,7 +199,7 @@ class Log:
         )
 
     def plot(self, **options: Any) -> Figure:
-        """Return a picture of the log; the options are those of `eval.figures.map_plot.plot_log`."""
+        """Draw the log; the options are those of `eval.figures.map_plot.plot_log`."""
         figure: Figure = pictures().plot_log(self, **options)
         return figure
 
@@ -233,7 +216,7 @@ class Log:
         odometry_sigma: ArrayLike | None = None,
         kind: Kind | None = None,
     ) -> Log:
-        """Return the log of body twists (N, 3) at t (N,) and of points (m, 2) detected at detection_t (m,).
+        """Make the log of body twists (N, 3) at t (N,) and of points (m, 2) detected at detection_t (m,).
 
         Units are s, m and rad, points are in the vehicle frame, and each twist is held until the next.
         Detections of one stamp are one cycle. A label is a number or a word, by default unknown.
@@ -244,8 +227,8 @@ class Log:
         K = np.asarray(ray_covariances(points, SIGMA_DETECTIONS) if m is None else m, float).reshape(-1, 4)
         words = [label_from_name(one) if isinstance(one, str) else one for one in labels or ()]
         labelled = words if labels is not None else np.full(len(points), UNKNOWN)
-        odometry = _read_odometry(_as_table(ODOMETRY_FILE, t, twist))
-        found = _as_table(DETECTIONS_FILE, detection_t, points, labelled, K[:, [0, 1, 3]])
+        odometry = _read_odometry(_of_arrays(ODOMETRY_FILE, t, twist))
+        found = _of_arrays(DETECTIONS_FILE, detection_t, points, labelled, K[:, [0, 1, 3]])
         return cls(
             odometry,
             _cycles(found, float(odometry.t[0]), float(odometry.t[-1])),
@@ -265,50 +248,31 @@ def read_log(folder: Path | str) -> Log:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
-    header = Header(folder / LOG_FILE)
+    file = folder / LOG_FILE
+    header = headers.read_header(file)
     odometry, table = _read_odometry(_table(folder, ODOMETRY_FILE)), _table(folder, DETECTIONS_FILE)
-    truth = header.section("truth")
-    true_errors = {
-        name: np.array([header.numbers("truth", entry).item() for entry in entries])
-        for name, entries in _TRUE_ERRORS.items()
-        if truth and (entries == CALIBRATION or not truth.keys().isdisjoint(entries))
-    }
     return Log(
         odometry=odometry,
         cycles=_cycles(table, float(odometry.t[0]), float(odometry.t[-1])),
-        odometry_sigma=header.numbers("odometry", "sigma", 3, POSITIVE),
-        sensor=_read_sensor(header),
-        source={key: str(value) for key, value in header.section("source").items()},
-        **header.noise(),
-        truth=_read_truth(folder, len(table), true_errors),
+        odometry_sigma=np.array(header.odometry.sigma),
+        sensor=SensorInfo(**asdict(header.sensor)),
+        source={key: str(value) for key, value in header.source.items()},
+        odometry_stated=header.noise.odometry == headers.STATED,
+        detections_stated=header.noise.detections == headers.STATED,
+        measured=headers.measured_noise(header, file),
+        truth=_read_truth(folder, len(table), headers.true_errors(header, file)),
     )
 
 
-def _read_sensor(header: Header) -> SensorInfo:
-    numbers = [name for name in ("range_max", "fov", "rate") if name in header.section("sensor")]
-    values = {name: header.numbers("sensor", name, 1, POSITIVE).item() for name in numbers}
-    return SensorInfo(**values, kind=header.word("sensor", "kind", KINDS))
-
-
 def _table(folder: Path, name: str) -> Table:
-    """Return a table of a log; one of the truth that is not known has no rows."""
+    """Read a table of a log; an unknown one of the truth has no rows."""
     if name in TRUTH_FILES and not (folder / name).exists():
-        return Table(
-            folder / name, dict.fromkeys(COLUMNS[name], np.zeros(0)), np.zeros(0, int), COLUMNS[name]
-        )
+        return Table.of_arrays(folder / name, COLUMNS[name], np.zeros((0, len(COLUMNS[name]))))
     return read_table(folder / name, COLUMNS[name])
 
 
-def _as_table(name: str, *values: ArrayLike) -> Table:
-    """Return arrays (rows,) and (rows, k) as the table that is read from a file with their columns."""
-    file, columns = Path(name).with_suffix(""), COLUMNS[name]
-    try:
-        rows = np.column_stack([np.asarray(value, float) for value in values])
-    except ValueError as error:
-        raise InputError(file, f"expected arrays of numbers with a row each: {error}") from None
-    if rows.shape[1] != len(columns):
-        raise InputError(file, f"expected the columns {', '.join(columns)}, found {rows.shape[1]}")
-    return Table(file, dict(zip(columns, rows.T, strict=True)), np.arange(len(rows)) + 1, columns)
+def _of_arrays(name: str, *values: ArrayLike) -> Table:
+    return Table.of_arrays(Path(name).with_suffix(""), COLUMNS[name], *values)
 
 
 def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
@@ -318,7 +282,7 @@ def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
     """
     check_type("log", log, Log)
     with atomic_folder(folder, LOG_FILE) as target:
-        (target / LOG_FILE).write_text(to_toml(_sections(log)), encoding="utf-8", newline="\n")
+        (target / LOG_FILE).write_text(headers.to_toml(_sections(log)), encoding="utf-8", newline="\n")
         for name, values in _columns(log).items():
             write_table(target / name, COLUMNS[name], *values)
         if check:
@@ -361,7 +325,7 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
 
 
 def cycles_of(t: Array, points: Array, covariances: Array, labels: IntArray) -> tuple[Detections, ...]:
-    """Return the perception cycles of detections (m,) at stamps (s), see `is_one_cycle`."""
+    """Group detections (m,) at stamps (s) to perception cycles, see `is_one_cycle`."""
     starts: list[int] = []
     for row, stamp in enumerate(t.tolist()):
         if not starts or not is_one_cycle(stamp, t[starts[-1]]):
@@ -371,50 +335,11 @@ def cycles_of(t: Array, points: Array, covariances: Array, labels: IntArray) -> 
 
 
 def is_one_cycle(t: float, begin: float) -> bool:
-    """Return whether detections at t (s) belong to the cycle that begins at a stamp (s), and has that stamp.
+    """Whether detections at t (s) belong to the cycle that begins at a stamp (s), and has that stamp.
 
     Several cameras, and stamps that were rounded to milliseconds, differ by `MIN_INTERVAL` or less.
     """
     return abs(t - begin) <= MIN_INTERVAL + ROUND_OFF
-
-
-def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
-    return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
-
-
-def polar_covariances(bearings: Array, along: Array, across: Array) -> Array:
-    """Return `R(b) diag(along, across) R(b)^T` (m, 2, 2) of variances (m,) along rays and across them."""
-    c, s = np.cos(bearings), np.sin(bearings)
-    xx, yy = c * c * along + s * s * across, s * s * along + c * c * across
-    return covariances_of(xx, c * s * (along - across), yy)
-
-
-def ray_covariances(points: Array, sigmas: Iterable[float]) -> Array:
-    """Return covariances (m, 2, 2) by (s_range, s_growth, s_bearing) of points (m, 2) at ranges r.
-
-    `(s_range + s_growth r)^2` along the ray, `(r s_bearing)^2` across it.
-    """
-    ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
-    begin, growth, bearing = sigmas
-    across = (np.maximum(ranges, MIN_RANGE_OF_BEARING) * bearing) ** 2
-    return polar_covariances(bearings, (begin + growth * ranges) ** 2, across)
-
-
-def without_stated_noise(log: Log) -> Log:
-    """Return a log as it is made of a record that says nothing of its noise, nor of the sensor."""
-    cycles = tuple(
-        replace(cycle, covariances=ray_covariances(cycle.points_vehicle, SIGMA_DETECTIONS))
-        for cycle in log.cycles
-    )
-    log = replace(log, cycles=cycles, odometry_sigma=np.array(SIGMA_ODOMETRY), sensor=SensorInfo())
-    return replace(log, odometry_stated=False, detections_stated=False)
-
-
-def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:
-    """Return which covariances (m,) are positive definite, by their entries."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
-    return np.asarray(good)
 
 
 def labels_of(table: Table) -> IntArray:
@@ -433,8 +358,8 @@ def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) ->
 
 def _associations(table: Table, detection_count: int, cone_count: int) -> IntArray:
     if len(table) != detection_count:
-        expected = f"expected a row for each of {detection_count} detections"
-        raise InputError(table.file, f"{expected}, found {len(table)}")
+        expected = f"a row for each of {detection_count} detections"
+        raise InputError(table.file, f"expected {expected}, found {len(table)}")
     cones = table.numbers("cone")
     good = (cones == np.floor(cones)) & (cones >= -1) & (cones < cone_count)
     table.require(good, f"expected -1 or the index of one of {cone_count} true cones")
@@ -443,18 +368,14 @@ def _associations(table: Table, detection_count: int, cone_count: int) -> IntArr
 
 def _sections(log: Log) -> dict[str, dict[str, Any]]:
     truth = dict[str, Any]()
-    for name, entries in _TRUE_ERRORS.items():
+    for name, entries in headers.TRUE_ERRORS.items():
         values = getattr(log.truth, name, None)
-        truth |= {} if values is None else dict(zip(entries, values.tolist(), strict=True))
+        truth |= {} if values is None else dict(zip(entries, values, strict=True))
     return {
-        "odometry": {"sigma": [float(value) for value in log.odometry_sigma]},
-        "sensor": {
-            name: value if isinstance(value, str) else float(value)
-            for name, value in vars(log.sensor).items()
-            if value is not None
-        },
-        **noise_sections(log.odometry_stated, log.detections_stated, log.measured),
-        "source": {toml_text(key): value for key, value in log.source.items()},
+        "odometry": {"sigma": log.odometry_sigma},
+        "sensor": vars(log.sensor),
+        **headers.noise_sections(log.odometry_stated, log.detections_stated, log.measured),
+        "source": {headers.toml_text(key): value for key, value in log.source.items()},
         **({"truth": truth} if truth else {}),
     }
 

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"
-NO_COVARIANCE: Final[Array] = np.zeros((0, 0))  # none was asked for; it can't be written
-NO_CONES: Final[Array] = np.zeros((0, 2))  # none is known by its place
+NO_COVARIANCE: Final[Array] = np.zeros((0, 0))  # not requested; such a map can't be written
+NO_CONES: Final[Array] = np.zeros((0, 2))
 _SYMMETRY_TOLERANCE = 1e-9  # largest |P - P^T| over max|P| of a covariance that is symmetric to rounding
 _NEGATIVE_TOLERANCE = 1e-9  # most negative eigenvalue over the largest one of P >= 0, to rounding
 
@@ -43,13 +43,13 @@ class SplineBoundary(Brief):
     covariance: Array
     """Joint covariance (2m, 2m) in m^2 of the distinct control points, in the order x0, y0, x1 and so on."""
     confirmed_until: float = math.inf
-    """Parameter up to which the curve is confirmed; beyond, it is tentative, and may be taken back."""
+    """Parameter up to which the curve is confirmed; beyond, it is tentative and may be retracted."""
     cones: Array = field(default_factory=NO_CONES.copy)
     """Cones (k, 2) on the curve whose places are known: parameters, and standard deviations along it (m)."""
 
     @property
     def size(self) -> int:
-        """Return the number m of distinct control points."""
+        """Number m of distinct control points."""
         return self.spline.size
 
 
@@ -119,12 +119,12 @@ class Map:
 
     @property
     def left(self) -> MapBoundary:
-        """Return the left boundary; a SettingsError where it could not be mapped."""
+        """Left boundary; a SettingsError where it could not be mapped."""
         return self._boundary(LEFT)
 
     @property
     def right(self) -> MapBoundary:
-        """Return the right boundary, in the same way."""
+        """Right boundary; a SettingsError where it could not be mapped."""
         return self._boundary(RIGHT)
 
     def _boundary(self, label: int) -> MapBoundary:
@@ -133,7 +133,7 @@ class Map:
         return self.boundaries[label]
 
     def plot(self, **options: Any) -> Figure:
-        """Return a picture of the map; the options are those of `eval.figures.map_plot.plot_map`."""
+        """Draw the map; the options are those of `eval.figures.map_plot.plot_map`."""
         figure: Figure = pictures().plot_map(self, **options)
         return figure
 
@@ -142,7 +142,7 @@ class Map:
         return sum(boundary.size for boundary in self.boundaries.values())
 
     def centre_line(self, step: float = 1.0) -> CentreLine:
-        """Return the centre line with widths, heading, curvature and arc length, and their sigmas.
+        """Centre line with widths, heading, curvature and arc length, and their sigmas.
 
         Its points are `step` (m) apart, also along a tentative stretch. Without a joint covariance the
         boundaries are taken as independent. SettingsError unless both are splines and side by side.
@@ -153,19 +153,19 @@ class Map:
 
     @property
     def splines(self) -> dict[int, BSpline]:
-        """Return the boundaries that are curves, by label."""
+        """Boundaries that are curves, by label."""
         boundaries = self.boundaries.items()
         return {label: one.spline for label, one in boundaries if isinstance(one, SplineBoundary)}
 
     def curves(self, purpose: str) -> tuple[SplineBoundary, SplineBoundary]:
-        """Return both boundaries, which must be curves, and both closed or both open."""
+        """Both boundaries, which must be curves, and both closed or both open."""
         left, right = (self.curve(label, purpose) for label in BOUNDARIES)
         if left.spline.periodic != right.spline.periodic:
             raise SettingsError(f"{purpose}: expected both boundaries closed or both open, found one of each")
         return left, right
 
     def curve(self, label: int, purpose: str) -> SplineBoundary:
-        """Return a boundary that is a curve; a SettingsError says for which purpose one was expected."""
+        """Boundary that must be a curve; a SettingsError names the purpose."""
         boundary = self.boundaries.get(label)
         if isinstance(boundary, SplineBoundary):
             return boundary
@@ -173,7 +173,7 @@ class Map:
         raise SettingsError(f"{purpose}: expected a curve as {NAMES[label]} boundary, found {found}")
 
     def covariance_of(self, left: SplineBoundary, right: SplineBoundary) -> Array | None:
-        """Return the covariance of both boundaries' control points; None where it wasn't asked for."""
+        """Covariance of both boundaries' control points; None where it was not requested."""
         if self.joint_covariance is not None:
             return self.joint_covariance
         if any(boundary.covariance.shape[0] != 2 * boundary.size for boundary in (left, right)):
@@ -182,7 +182,7 @@ class Map:
 
 
 def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Array:
-    """Return a joint covariance (2m, 2m) with each boundary's own one, which may hold more, inside."""
+    """Replace the diagonal blocks of a joint covariance (2m, 2m) by each boundary's own."""
     joint, at = joint.copy(), 0
     for _, boundary in sorted(boundaries.items()):
         own = slice(at, at := at + len(boundary.covariance))
@@ -191,7 +191,7 @@ def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Arr
 
 
 def map_to_json(track: Map) -> dict[str, Any]:
-    """Return the content of `map.json` in plain Python types, every number to full precision."""
+    """Content of `map.json` in plain Python types, every number to full precision."""
     boundaries = {NAMES[label]: _boundary_to_json(own) for label, own in sorted(track.boundaries.items())}
     content = {"format": FORMAT, "closed": bool(track.closed), "boundaries": boundaries}
     if track.joint_covariance is not None and len(track.boundaries) == len(BOUNDARIES):
@@ -255,7 +255,7 @@ class _File(Struct):
 
 
 def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:
-    """Return the map of a `map.json`'s content; an InputError names `file` and what breaks FORMATS."""
+    """Build the map of a `map.json`'s content; an InputError names `file` and what breaks FORMATS."""
     file = Path(file)
     stated = typed(content, dict[str, Any], file).get("format")
     if stated != FORMAT:
@@ -333,6 +333,6 @@ def _is_covariance(P: Array) -> bool:
 
 
 def read_map(folder: Path | str) -> Map:
-    """Return the map of a folder that follows FORMATS, as those of `write_result` do, or of its map file."""
+    """Read the map of a folder that follows FORMATS, or of its map file."""
     file = Path(folder) if Path(folder).is_file() else Path(folder) / MAP_FILE
     return map_from_json(read_json(file, "a map"), file)

@@ -15,7 +15,7 @@ Run = TypeVar("Run", bound=RunResult)
 
 
 def moved(track: Map, motion: Array) -> Map:
-    """Return a map after a motion (3,), with its covariances; parameters along its curves stay."""
+    """Move a map and its covariances by a motion (3,); parameters along its curves stay."""
     boundaries = {label: _moved(boundary, motion) for label, boundary in track.boundaries.items()}
     points = {label: _moved_points(cones, motion) for label, cones in track.points.items()}
     joint = track.joint_covariance
@@ -23,7 +23,7 @@ def moved(track: Map, motion: Array) -> Map:
 
 
 def moved_run(run: Run, motion: Array) -> Run:
-    """Return a run with its last map and its trajectory after a motion (3,)."""
+    """Move the last map and the trajectory of a run by a motion (3,)."""
     return replace(run, map=moved(run.map, motion), trajectory=compose(motion, run.trajectory))
 
 
@@ -39,7 +39,7 @@ def _moved_points(cones: PointBoundary, motion: Array) -> PointBoundary:
 
 
 def _turned(covariance: Array, motion: Array) -> Array:
-    """Return a covariance (2m, 2m) of points in the turned frame."""
+    """Rotate a covariance (2m, 2m) of points."""
     turn = rotation(float(motion[2]))
     count = len(covariance) // 2
     blocks = covariance.reshape(count, 2, count, 2)

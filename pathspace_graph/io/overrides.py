@@ -15,12 +15,12 @@ Overrides = Mapping[str, Any]  # new values by dotted field
 
 
 def leaves(settings: Any) -> dict[str, Any]:
-    """Return the value of every dotted field of a settings dataclass, in order."""
+    """Value of every dotted field of a settings dataclass, in order."""
     return flatten(asdict(settings))
 
 
 def flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested tables with dotted names, which mean the same as TOML's dotted keys."""
+    """Flatten nested tables to dotted names, which mean the same as TOML's dotted keys."""
     flat: dict[str, Any] = {}
     for key, value in table.items():
         name = f"{prefix}{key}"
@@ -29,7 +29,7 @@ def flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def override(settings: T, overrides: Overrides, where: str) -> T:
-    """Return the settings with some dotted fields overridden; a wrong field or value is a SettingsError."""
+    """Override some dotted fields of settings; a wrong field or value is a SettingsError."""
     known, before = leaves(settings), f"{where}." if where else ""
     for name, value in overrides.items():
         if name not in known:
@@ -75,7 +75,7 @@ def _set(settings: Any, path: list[str], value: Any, where: str) -> Any:
 
 
 def as_type(value: Any, hint: Any, where: str) -> Any:
-    """Return a value of TOML in the type of a field: a list as a tuple, a whole number as a float."""
+    """Convert a value of TOML to the type of a field: a list to a tuple, a whole number to a float."""
     fitting = _converted(value, hint)
     if not is_of(fitting, hint):
         raise SettingsError(f"{where}: expected {in_words(hint)}, found {shown(value)}")

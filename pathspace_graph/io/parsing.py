@@ -15,7 +15,7 @@ from io import BytesIO, TextIOWrapper
 from itertools import chain, islice
 from pathlib import Path
 from reprlib import Repr
-from typing import Any, Final, NamedTuple, NoReturn, TypeVar
+from typing import Any, Final, NamedTuple, NoReturn, Self, TypeVar
 
 import msgspec
 import numpy as np
@@ -55,7 +55,7 @@ _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 80, 60, 
 
 
 def shown(value: Any) -> str:
-    """Return a value as a message shows it: short, whatever it holds."""
+    """Short text of any value, for a message."""
     text = _SHORT.repr(value)
     return text if len(text) <= SHOWN_CHARACTERS else text[: SHOWN_CHARACTERS - 3] + "..."
 
@@ -90,7 +90,7 @@ _ERRORS: Final = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeE
 
 
 def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> str:
-    """Return the text of a file in UTF-8, or in UTF-16 with a byte-order mark, of at most `most` bytes.
+    """Read the text of a file in UTF-8, or in UTF-16 with a byte-order mark, of at most `most` bytes.
 
     An InputError says what was `expected`.
     """
@@ -109,7 +109,7 @@ def _decoded(data: bytes, file: Path) -> str:
 
 
 def read_bytes(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> bytes:
-    """Return the bytes of a file, at most `most`; an InputError says that `expected` was expected."""
+    """Read the bytes of a file, at most `most`; an InputError says what was `expected`."""
     try:
         found = file.stat()
         if not stat.S_ISREG(found.st_mode):  # a pipe would block where it is opened
@@ -150,12 +150,12 @@ def _parsed(kind: str, load: Callable[[str], Any], text: str, file: Path) -> Any
 
 
 def parse_json(text: str, file: Path) -> Any:
-    """Return the content of JSON; an InputError names the file and, where it is known, the row."""
+    """Parse JSON; an InputError names the file and, where it is known, the row."""
     return _parsed("JSON", json.loads, text, file)
 
 
 def read_json(file: Path, expected: str) -> Any:
-    """Return the content of a JSON file; an InputError says that `expected` was expected where it fails."""
+    """Read a JSON file; an InputError says what was `expected`."""
     return parse_json(read_text(file, expected), file)
 
 
@@ -165,7 +165,7 @@ def parse_toml(text: str, file: Path) -> dict[str, Any]:
 
 
 def typed(value: Any, kind: type[T], file: Path, where: str = "", *, strict: bool = True) -> T:
-    """Return plain data in a type, checked by msgspec; an InputError names the file and the dotted key.
+    """Convert plain data to a type, checked by msgspec; an InputError names the file and the dotted key.
 
     Unless it is `strict`, a text may stand for a number: YAML takes 1e-5 for a word.
     """
@@ -231,6 +231,17 @@ class Table:
     lines: IntArray  # line of each row in the file; the header is line 1
     declared: Mapping[str, Column] = field(default_factory=dict)
 
+    @classmethod
+    def of_arrays(cls, file: Path, declared: Mapping[str, Column], *values: ArrayLike) -> Self:
+        """Make the table of arrays (rows,) and (rows, k) that a file with their columns would give."""
+        try:
+            rows = np.column_stack([np.asarray(value, float) for value in values])
+        except ValueError as error:
+            raise InputError(file, f"expected arrays of numbers with a row each: {error}") from None
+        if rows.shape[1] != len(declared):
+            raise InputError(file, f"expected the columns {', '.join(declared)}, found {rows.shape[1]}")
+        return cls(file, dict(zip(declared, rows.T, strict=True)), np.arange(len(rows)) + 1, declared)
+
     def __len__(self) -> int:
         return len(self.lines)
 
@@ -243,7 +254,7 @@ class Table:
             self.fail(int(np.argmin(good)), message)
 
     def numbers(self, name: str, largest: float | None = None, *, missing: bool = False) -> Array:
-        """Return the column as finite numbers (rows,), at most as large as declared, or as `largest`.
+        """Column as finite numbers (rows,), at most as large as declared, or as `largest`.
 
         With `missing`, a number may be missing, as in `MISSING`, or not be finite; NaN stands for both.
         """
@@ -262,7 +273,7 @@ class Table:
         return np.where(known, values, np.nan)
 
     def stack(self, names: Sequence[str], largest: float | None = None) -> Array:
-        """Return the named columns side by side (rows, names), see `numbers`."""
+        """Named columns side by side (rows, names), see `numbers`."""
         return np.column_stack([self.numbers(name, largest) for name in names])
 
 
@@ -337,7 +348,7 @@ def _read_rows(
 def _columns(
     file: Path, rows: Sequence[list[str]], lines: Sequence[int], width: int
 ) -> Iterable[Sequence[str]]:
-    """Return the fields of rows column by column; empty ones at the end of a row may be too many."""
+    """Transpose rows to columns; surplus empty fields at the end of a row are dropped."""
     for row, line in zip(rows, lines, strict=True):
         while len(row) > width and not row[-1].strip():
             row.pop()
@@ -347,7 +358,7 @@ def _columns(
 
 
 def _with_point(text: str) -> str:
-    """Return a number with a decimal point in place of a comma, and any other text as it is."""
+    """Replace the decimal comma of a number by a point; any other text is unchanged."""
     number = _DECIMAL_COMMA.fullmatch(text.strip())
     return f"{number[1]}.{number[2]}" if number else text
 
@@ -362,7 +373,7 @@ def write_table(file: Path, names: Iterable[str], *values: ArrayLike) -> None:
 
 
 def is_plain(text: str) -> bool:
-    """Return whether numbers are written in ASCII and without underscores, which Python would also read."""
+    """Whether numbers are in ASCII and have no underscores, which Python would also read."""
     return text.isascii() and "_" not in text
 
 

@@ -1,4 +1,4 @@
-"""What a run leaves (FORMATS): its map, trajectory in the TUM format, cycles and summary in one folder."""
+"""Result of a run (FORMATS): map, trajectory in the TUM format, cycles and summary in one folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pathspace_graph.lengths import POSE_LENGTHS, scaled
 
 from .brief import Brief, frames
 from .files import atomic_folder, write_json
-from .log import CALIBRATION
+from .header import CALIBRATION
 from .map import MAP_FILE, Map, map_to_json
 from .parsing import MAX_COORDINATE, MAX_STAMP, is_plain, read_text, shown, write_table
 
@@ -45,7 +45,7 @@ def write_trajectory(file: Path, t: ArrayLike, poses: ArrayLike) -> None:
 
 
 def read_trajectory(file: Path) -> tuple[Array, Array]:
-    """Return stamps (n,) in s and poses [x, y, theta] (n, 3), map frame; an InputError names a wrong row."""
+    """Read stamps (n,) in s and poses [x, y, theta] (n, 3), map frame; an InputError names a wrong row."""
     lines = enumerate(read_text(file, "a trajectory").split("\n"), start=1)
     rows = [_values(file, line, n) for n, line in lines if line.strip() and not line.startswith("#")]
     values = np.array(rows).reshape(-1, _COLUMNS)
@@ -100,11 +100,11 @@ class CycleRecord:
     jump: tuple[float, float, float] | None = None
     """Jump of the newest pose [m, m, rad], map frame, where the map was replaced in this cycle."""
     notice: str = ""
-    """What a user should know of the cycle, if anything."""
+    """Notice for the user about the cycle, if any."""
     offered: int = 0
     """Number of the cycle's detections."""
     health: str = ""
-    """Good, degraded or lost; empty where the estimator does not say it."""
+    """Good, degraded or lost; empty where the estimator does not report it."""
     reason: str = ""
     """Why the estimate is not good."""
     dropped: int = 0
@@ -117,7 +117,7 @@ class CycleRecord:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class VehicleState(Brief):
-    """What an estimator believes of the vehicle: its pose, and the calibration of its odometry."""
+    """Estimate of the vehicle: pose, and calibration of odometry and sensor."""
 
     LENGTHS: ClassVar = {"pose": POSE_LENGTHS, "sensor": (0, 1, 0, 0, 1)}
     COVARIANCES: ClassVar = {"covariance": (*POSE_LENGTHS, 0, 0), "sensor_covariance": (0, 1, 0, 0, 1)}
@@ -135,7 +135,7 @@ class VehicleState(Brief):
 
     @property
     def by_name(self) -> dict[str, tuple[float, float]]:
-        """Return each calibration with its standard deviation, by its name in `CALIBRATION` and `SENSOR`."""
+        """Each calibration with its standard deviation, by its name in `CALIBRATION` and `SENSOR`."""
         values = np.append(self.calibration, self.sensor).tolist()
         of_sensor = np.sqrt(np.diag(self.sensor_covariance))
         sigmas = np.append(self.sigmas[len(self.pose) :], of_sensor).tolist()
@@ -143,23 +143,23 @@ class VehicleState(Brief):
 
     @classmethod
     def split(cls, pose: Array, calibrations: Array, joint: Array) -> VehicleState:
-        """Return the state of a joint covariance of [pose | calibration of odometry | of sensor]."""
+        """Split the state of a joint covariance of [pose | calibration of odometry | of sensor]."""
         known = len(pose) + CALIBRATION_SIZE
         odometry, sensor = np.split(calibrations.copy(), [CALIBRATION_SIZE])
         return cls(pose.copy(), odometry, joint[:known, :known], sensor, joint[known:, known:])
 
     @property
     def sigmas(self) -> Array:
-        """Return the standard deviations (5,) of [pose | calibration]."""
+        """Standard deviations (5,) of [pose | calibration]."""
         return np.sqrt(np.diag(self.covariance))
 
 
 @dataclass(frozen=True)
 class LapBatches:
-    """Ends of the batches that another process solves while an online estimator goes on."""
+    """Ends of the batches that another process solves beside an online estimator."""
 
     ends: tuple[int, ...]
-    """Cycles in which the result of a batch was taken, or the batch was given up."""
+    """Cycles in which the result of a batch was swapped in, or the batch was abandoned."""
     late: int
     """Cycles by which the slowest batch is late in a vehicle, by its wall time."""
 
@@ -173,7 +173,7 @@ class RunNoise:
     odometry: NoiseSource
     detections: NoiseSource
     measured: MeasuredNoise | None = None
-    """What was measured in the drive, where anything was."""
+    """Noise that was measured in the drive, if any."""
     size: Literal["odometry", "ranges"] | None = None
     """Ranges and speeds disagree, and the size of the map is that of these; None where they agree."""
 
@@ -217,7 +217,7 @@ class RunResult:
     waited: float = 0.0
     """Wall time for which the run waited for batches between cycles, s."""
     noise: RunNoise | None = None
-    """Noise that was used, where the estimator says it."""
+    """Noise that was used, where the estimator reports it."""
     scale: float = 1.0
     """Size of the scene by that of a Formula Student track."""
     smoothed: Array | None = None
@@ -228,18 +228,18 @@ class RunResult:
         return f"{name},\n    {self.map})"
 
     def to_frame(self) -> pd.DataFrame:
-        """Return the run as a frame: a row for each cycle, as in `cycles.csv`, with its pose x, y, theta."""
+        """Convert the run to a frame: a row for each cycle, as in `cycles.csv`, with its pose x, y, theta."""
         frame: pd.DataFrame = frames().run_frame(self)
         return frame
 
     def plot(self, **options: Any) -> Figure:
-        """Return a picture of map and trajectory; the options are those of `Map.plot`."""
+        """Draw map and trajectory; the options are those of `Map.plot`."""
         health = [record.health for record in self.cycles]
         paths = {"trajectory": self.trajectory, "smoothed": self.smoothed}
         return self.map.plot(**paths, health=health, **options)
 
     def at_scale_one(self) -> Self:
-        """Return the result of a scene that is as large as a Formula Student track."""
+        """Rescale the result to the size of a Formula Student track."""
         return scaled(self, 1.0 / self.scale)
 
 

@@ -12,7 +12,7 @@ from .map import NO_COVARIANCE, Map, SplineBoundary
 
 
 def as_ribbon(track: Map, sigma_shape: float) -> Map:
-    """Return a map whose boundaries are the edges of a ribbon, or raise a SettingsError.
+    """Replace the boundaries of a map by the edges of its ribbon; SettingsError where none fits.
 
     `sigma_shape` (m) is what a ribbon cannot follow, one sigma, added to each control point of its edges.
     """
@@ -21,7 +21,7 @@ def as_ribbon(track: Map, sigma_shape: float) -> Map:
 
 
 def ribbon_of(track: Map) -> tuple[Ribbon, Array | None, dict[int, float]]:
-    """Return the ribbon between the boundaries of a map, or raise a SettingsError.
+    """Fit the ribbon between the boundaries of a map; SettingsError where none fits.
 
     With it come its covariance (3m, 3m), if known, and the parameter up to which each open edge is confirmed.
     """
@@ -37,7 +37,7 @@ def ribbon_of(track: Map) -> tuple[Ribbon, Array | None, dict[int, float]]:
 
 
 def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]) -> Map:
-    """Return the edges of a ribbon as a map, with the covariance (3m, 3m) of its control points, if known.
+    """Build the map of the edges of a ribbon, with the covariance (3m, 3m) of its control points, if known.
 
     `sigma_shape` (m) is added to each control point. Open edges are confirmed up to the parameters `until`.
     """

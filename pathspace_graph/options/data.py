@@ -1,4 +1,4 @@
-"""`simulate`, `convert` and `verify`: where logs come from, and whether files are as they were written."""
+"""`simulate`, `convert` and `verify`: sources of logs, and the check of written files."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -38,13 +38,13 @@ class Simulate:
 
     @classmethod
     def base(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of the presets, before any other option is set."""
+        """Settings of the presets, before any other option is set."""
         return {"settings": preset({group: given[group] for group in PRESETS if group in given})}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Convert:
-    """Write a ROS bag, CSV files or JSON lines as a log, and say what was left out.
+    """Write a ROS bag, CSV files or JSON lines as a log, and report what was dropped.
 
     A log is in order of time and in the vehicle frame. A folder of several records becomes a folder of logs.
     """
@@ -73,7 +73,7 @@ class Convert:
     frames: Frames = field(default_factory=Frames, metadata=INLINE)
     """Frames of the record."""
     window: Window = field(default_factory=Window, metadata=INLINE)
-    """Part of the record that counts."""
+    """Part of the record to convert."""
     noise: NoiseSettings = field(default_factory=NoiseSettings, metadata=INLINE)
     """Noise that the record does not state."""
 

@@ -1,4 +1,4 @@
-"""The help of a command and what a shell completes, both made of its options and of their docstrings."""
+"""Help of a command and completion by a shell, both from its options and their docstrings."""
 
 import ast
 import sys
@@ -25,7 +25,7 @@ MOST_COLUMNS: Final = 120
 
 
 def help_of(command: type[Any], program: str, *, full: bool = False) -> str:
-    """Return the help of a command: every option if `full`, else no groups, but the essential settings."""
+    """Help of a command: every option if `full`, else no groups, but the essential settings."""
     options = sorted(options_of(command), key=lambda option: option.group is not None)  # its own first
     places = "".join(f"{option.flag} " for option in options if option.is_place)
     lines = [f"usage: {program} {places}[OPTIONS]", "", *wrap(_sentences(command.__doc__, full), _columns())]
@@ -52,7 +52,7 @@ def _columns() -> int:
 
 
 def _entry(option: Option, full: bool) -> list[str]:
-    """Return an option with its default, or with what it takes, and its text beside it."""
+    """Lines of an option: its default or what it takes, and its text beside it."""
     name, default = option.usage, option.entry.default
     if option.kind is bool:
         name = option.flags[bool(default)]
@@ -70,7 +70,7 @@ def _entry(option: Option, full: bool) -> list[str]:
 
 
 def _sentences(text: str | None, full: bool = False) -> str:
-    """Return a text on one line, only its first sentence unless it is asked for in full."""
+    """A text on one line; only its first sentence unless `full`."""
     line = " ".join(str(text).split())
     return line if full else line.split(". ", 1)[0].removesuffix(".")
 
@@ -82,7 +82,7 @@ def _tree(file: str) -> ast.Module:
 
 @cache
 def _texts(kind: type[Any]) -> dict[str, str]:
-    """Return the text below each field of a class, as its source has it."""
+    """Text below each field of a class, as its source has it."""
     file = getattr(sys.modules[kind.__module__], "__file__", None)
     classes = [node for node in _tree(file).body if isinstance(node, ast.ClassDef)] if file else []
     body = next((node.body for node in classes if node.name == kind.__name__), [])
@@ -110,7 +110,7 @@ complete -o default -F _pathspace_graph {program}"""
 
 
 def completion(program: str, commands: Mapping[str, type[Any]], common: Iterable[str]) -> str:
-    """Return a script for bash and zsh that completes commands, options, known values and names of files."""
+    """A script for bash and zsh that completes commands, options, known values and names of files."""
     cases = []
     for name, command in commands.items():
         options = [*options_of(command)]

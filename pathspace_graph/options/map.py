@@ -1,4 +1,4 @@
-"""`demo`, `online`, `batch`, `plot` and `export`: maps of logs, and what is made of them."""
+"""`demo`, `online`, `batch`, `plot` and `export`: maps of logs, and exports of them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -6,6 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
+from pathspace_graph.settings.checked import Checked
 from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
 from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.settings.output import FilmSettings, RecordingSettings, SpeedSettings
@@ -29,7 +30,7 @@ class Estimation:
 
     @classmethod
     def base(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the settings of the file, before any other option is set."""
+        """Settings of the file, before any other option is set."""
         if "settings" not in given:
             return {}
         overrides = import_module("pathspace_graph.io.overrides")  # the help need not wait for NumPy
@@ -51,7 +52,7 @@ class Demo(Estimation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Online(Estimation):
+class Online(Checked, Estimation, group=""):
     """Map a log online, cycle by cycle, and write the map, the trajectory, the cycles and a summary."""
 
     log: Path = field(metadata=PLACE)
@@ -67,17 +68,17 @@ class Online(Estimation):
     start: tuple[float, float, float] | None = None
     """Pose X Y HEADING (m, m, rad) on the known map near which the drive begins; by default anywhere."""
     keep_map: bool = False
-    """Hold the known map as it is, and only localize."""
+    """Keep the known map fixed, and only localize."""
     map_sigma: float = 0.15
     """Standard deviation of the cones of a track file, m."""
     save: Path | None = None
     """File to which the mapper is saved at the end, for `--resume`; only `fixed-lag` can be saved."""
     resume: Path | None = None
-    """File of a saved mapper, which goes on with its settings, and with cycles after its newest."""
+    """File of a saved mapper, which continues with its own settings and with cycles after its newest."""
     plot: Path | None = None
     """File for a picture of the map (.png, .pdf or .svg); an earlier one is kept as a numbered backup."""
     view: bool = False
-    """Show the run in the window of the live viewer rerun while it goes on."""
+    """Show the run in the live viewer rerun."""
     save_view: Path | None = None
     """File (.rrd) for what the viewer shows; an earlier one is kept as a numbered backup."""
     animate: Path | None = None
@@ -103,11 +104,11 @@ class Batch(Estimation):
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
     start: Start | None = None
-    """Where the optimization begins; by default as `batch.start` says."""
+    """Where the optimization begins; by default that of `batch.start`."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plot:
+class Plot(Checked, group=""):
     """Draw a map: both boundaries with their 2-sigma band, control points, trajectory and any truth."""
 
     map: Path = field(metadata=PLACE)
@@ -117,7 +118,7 @@ class Plot:
     log: Path | None = None
     """Folder of the log whose truth is drawn as well."""
     band_scale: float = 1.0
-    """Factor by which the band is drawn wider than it is, which the legend says."""
+    """Factor by which the band is widened in the picture; the legend states it."""
     title: str | None = None
     """Title of the picture."""
 
@@ -138,8 +139,8 @@ class Export:
     step: float = 1.0
     """Distance of the points along a curve (m)."""
     origin: tuple[float, float, float] | None = None
-    """Latitude and longitude of the map's origin (degrees, WGS84), and heading of its x axis, which is the
-    way that the vehicle faced at the start (degrees, clockwise from north). `geojson` and `lanelet2` need
+    """Latitude and longitude of the map's origin (degrees, WGS84), and heading of its x axis, the direction
+    of the vehicle at the start (degrees, clockwise from north). `geojson` and `lanelet2` need
     them."""
     speed: SpeedSettings = field(default_factory=SpeedSettings)
     """Vehicle of a `profile`."""

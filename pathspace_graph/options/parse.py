@@ -98,7 +98,7 @@ class Option:
         return self.flag if self.is_place else f"{self.flag} {self.takes}"
 
     def value(self, words: Sequence[str], flag: str = "") -> Any:
-        """Return the value of the words after a flag; SettingsError if they are not what the option takes."""
+        """Convert the words after a flag; SettingsError if the option does not take them."""
         if self.kind is bool and not words:
             return flag == self.flag
         if words == ["None"] and NoneType in get_args(self.hint):
@@ -120,7 +120,7 @@ def _shown(words: Sequence[str]) -> str:
 
 
 def _item(kind: Any) -> Any:
-    """Return the type of a single word."""
+    """Type of a single word."""
     return get_args(kind)[0] if get_origin(kind) is tuple else kind
 
 
@@ -152,7 +152,7 @@ def options_of(
 
 
 def parse(command: type[Any], program: str, words: Sequence[str]) -> Any:
-    """Return the command that the words ask for; SettingsError for bad usage."""
+    """Parse the words of a command line; SettingsError for bad usage."""
     options = [*options_of(command)]
     try:
         given = _given(options, words, program.rsplit(maxsplit=1)[-1])
@@ -164,7 +164,7 @@ def parse(command: type[Any], program: str, words: Sequence[str]) -> Any:
 
 
 def _given(options: Sequence[Option], words: Sequence[str], name: str) -> dict[str, Any]:
-    """Return the values of the options that are given, by name; SettingsError if any is wrong or missing."""
+    """Values of the options that are given, by name; SettingsError if any is wrong or missing."""
     flags = {flag: option for option in options if not option.is_place for flag in option.flags}
     given, places, rest = dict[str, Any](), list[str](), [*words]
     while rest:
@@ -197,7 +197,7 @@ def _given(options: Sequence[Option], words: Sequence[str], name: str) -> dict[s
 def _made(
     kind: type[Any], given: Mapping[tuple[str, ...], Any], base: Mapping[str, Any], path: tuple[str, ...] = ()
 ) -> Any:
-    """Return a dataclass of the values given, by path, else of those of `base`, else of the defaults."""
+    """Make a dataclass of the given values by path, else of `base`, else of the defaults."""
     hints: dict[str, Any] = get_type_hints(kind)
     own = dict(base)
     for entry in fields(kind):

@@ -1,4 +1,4 @@
-"""`compare`, `ablate`, `faults`, `scale` and `report`: many runs, and what is measured of them."""
+"""`compare`, `ablate`, `faults`, `scale` and `report`: many runs, and their statistics."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +15,7 @@ STUDIES = tuple(sorted(file.stem for file in (Path(__file__).parents[1] / "eval"
 
 @dataclass(frozen=True, kw_only=True)
 class Compare(Estimation):
-    """Run every estimator on a log, or on a folder of logs; or lay a map on another one.
+    """Run every estimator on a log or a folder of logs; or compare two maps.
 
     Of logs, tables, figures and all maps are written; of two maps, their distances and a picture.
 
@@ -23,7 +23,7 @@ class Compare(Estimation):
     For several logs the tables have means, and differences from the reference, paired over the logs, with
     their 95 % confidence interval. An estimator that fails is reported and does not stop the others; the exit
     code is 3 then. Finished runs are kept in `OUT.unfinished` until all are there, so that the same command
-    goes on where it was killed.
+    resumes after it was killed.
     """
 
     log: tuple[Path, ...] = field(metadata=PLACE)
@@ -107,8 +107,8 @@ class Scale(Estimation):
     estimators: tuple[str, ...] = field(default=(), metadata={"words": ONLINE_NAMES})
     """Names of the online estimators; by default all."""
     quick: bool = False
-    """Take less than a minute, with small maps and few laps, to see that everything works. It goes with no
-    other `scaling` option."""
+    """Take less than a minute, with small maps and few laps, to see that everything works. It excludes all
+    other `scaling` options."""
     scaling: ScalingSettings = field(default_factory=ScalingSettings)
     """What is measured."""
 

@@ -13,7 +13,8 @@ from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.gate import TWIST
 from pathspace_graph.front_end.measurement import DRIFT, LEAST_NOISE
 from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_UNKNOWN, TwistRecord
-from pathspace_graph.io.log import CALIBRATION, Log
+from pathspace_graph.io.header import CALIBRATION
+from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
 from pathspace_graph.lengths import POSE_LENGTHS, Length, Text, joined, scaled
 from pathspace_graph.spline.crossing import Crossing, crossed_boundaries

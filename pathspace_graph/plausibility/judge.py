@@ -14,6 +14,7 @@ from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.front_end.kind import kind_of
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
 from pathspace_graph.io import log as logs
+from pathspace_graph.io.covariances import covariances_of
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.io.parsing import read_table, shown
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
@@ -393,7 +394,7 @@ def refused_hints(folder: Path) -> list[Hint]:
             odometry.numbers("t", LARGEST_READING), odometry.stack(("vx", "vy", "wz"), LARGEST_READING)
         )
         stamps, points = table.numbers("t", LARGEST_READING), table.stack(("x", "y"), LARGEST_READING)
-        covariances = logs.covariances_of(*table.stack(("xx", "xy", "yy"), LARGEST_READING).T)
+        covariances = covariances_of(*table.stack(("xx", "xy", "yy"), LARGEST_READING).T)
     except InputError:
         return []
     cycles = logs.cycles_of(stamps, points, covariances, logs.labels_of(table))

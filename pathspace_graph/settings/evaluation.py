@@ -1,14 +1,14 @@
-"""Settings of what judges estimators: what a ghost is, and how far the time of an update is measured."""
+"""Settings of the evaluation: definition of a ghost, and extent of the timing."""
 
 from dataclasses import dataclass
 
 from pathspace_graph.errors import SettingsError
 
-from .checked import Positive
+from .checked import Checked
 
 
 @dataclass(frozen=True)
-class GhostSettings(Positive):
+class GhostSettings(Checked):
     """Definition of a ghost."""
 
     distance: float = 2.0
@@ -17,8 +17,8 @@ class GhostSettings(Positive):
 
 
 @dataclass(frozen=True)
-class ScalingSettings(Positive):
-    """What is measured of how time scales."""
+class ScalingSettings(Checked):
+    """Extent of the timing."""
 
     cones_min: float = 50.0
     """Least number of cones seen of a point of the sweep over cones."""

@@ -6,7 +6,7 @@ from typing import ClassVar, Final, Literal
 from pathspace_graph.errors import SettingsError, check_type
 from pathspace_graph.labels import LEFT, RIGHT, Kind
 
-from .checked import Positive
+from .checked import Checked, Unlimited
 from .online import (
     CalibrationSettings,
     ClosingSettings,
@@ -27,7 +27,7 @@ _LINES: Final[dict[Kind | None, tuple[int, ...]]] = {  # boundaries that are lin
 
 
 @dataclass(frozen=True)
-class SplineSettings(Positive):
+class SplineSettings(Checked):
     """The two boundary curves."""
 
     degree: int = 3
@@ -75,7 +75,7 @@ class ExactSplineSettings(SplineSettings, group="spline"):
 
 
 @dataclass(frozen=True)
-class GaugeSettings(Positive):
+class GaugeSettings(Checked):
     """The weak priors on what detections leave free."""
 
     sigma_spacing: float = 0.3
@@ -87,14 +87,12 @@ class GaugeSettings(Positive):
 
 
 @dataclass(frozen=True)
-class GateSettings(Positive):
+class GateSettings(Checked):
     """Which detections are used, and how much they weigh."""
-
-    UNLIMITED = ("huber",)
 
     chi: float = 3.0
     """Gate of a detection's distance from a curve, in standard deviations of their joint uncertainty."""
-    huber: float = 1.5
+    huber: Unlimited = 1.5
     """Whitened residual beyond which the Huber loss reduces a weight; `inf` for plain least squares."""
 
     view_ahead: ClassVar[float] = 25.0  # m along a curve, of the farthest place ahead that a detection is on
@@ -112,7 +110,7 @@ class GateSettings(Positive):
 
 
 @dataclass(frozen=True)
-class FarSettings(Positive):
+class FarSettings(Checked):
     """The inactive part of the map, which is not solved for in every cycle.
 
     What is inactive keeps its linearization: a closed map differs by millimetres to centimetres, an open one
@@ -126,11 +124,11 @@ class FarSettings(Positive):
 
 
 @dataclass(frozen=True)
-class RelinearizeSettings(Positive):
-    """Which factors of the window are linearized anew in a step: those whose variables moved.
+class RelinearizeSettings(Checked):
+    """Which factors of the window are relinearized in a step: those whose variables moved.
 
-    This applies after the loop has closed. Until then all factors are linearized anew, since an error of
-    linearization turns the map with a long lever there.
+    This applies after the loop has closed. Until then all factors are relinearized, since an error of
+    linearization rotates the map with a long lever.
     """
 
     point: float = 0.2
@@ -143,7 +141,7 @@ class RelinearizeSettings(Positive):
 
 
 @dataclass(frozen=True)
-class ClosureSettings(Positive, group="batch.closure"):
+class ClosureSettings(Checked, group="batch.closure"):
     """When a closed loop is believed."""
 
     used: float = 2.0 / 3.0
@@ -151,10 +149,8 @@ class ClosureSettings(Positive, group="batch.closure"):
 
 
 @dataclass(frozen=True)
-class OpenLapSettings(Positive, group="open_lap"):
+class OpenLapSettings(Checked, group="open_lap"):
     """Batch over the open lap, which closes the loop online."""
-
-    UNLIMITED = ("max_cycles", "max_cones")
 
     prior: Literal["batch", "window"] = "batch"
     """Prior after closing: a batch over the open lap, or with `window` what the window has marginalized."""
@@ -163,19 +159,19 @@ class OpenLapSettings(Positive, group="open_lap"):
     cycles_share: float = 0.03
     """Share of a long lap's cycles that replaces `cycles` where it is more; the window grows until then."""
     late: int = 100
-    """Most cycles by which a batch may be late, after which it is given up, as with more than `max_poses`."""
+    """Most cycles by which a batch may be late, after which it is abandoned, as beyond `max_poses`."""
     ends: tuple[int, ...] = ()
     """Cycles in which the batches replace the prior in a replay: `batches.ends` of `summary.json`."""
     retry: float = 20.0
     """Least length of path from one batch of the lap to the next, where it does not agree (m)."""
-    max_cycles: float = 6000.0
+    max_cycles: Unlimited = 6000.0
     """Most cycles of an open lap that is solved as a batch; a longer one is left to the window."""
-    max_cones: float = 1500.0
+    max_cones: Unlimited = 1500.0
     """Most cones of a lap that is solved as a batch, since with more it would not be in time."""
 
 
 @dataclass(frozen=True)
-class BatchSettings(Positive):
+class BatchSettings(Checked):
     """The batch optimization over a whole log."""
 
     start: Start = "auto"
@@ -195,11 +191,11 @@ class BatchSettings(Positive):
 
 
 @dataclass(frozen=True)
-class CkfSettings(Positive):
+class CkfSettings(Checked):
     """The paper's filters."""
 
     ridge: float = 0.05
-    """Lambda of the ridge regression, which holds control points at their places (paper: Update)."""
+    """Lambda of the ridge regression, which ties control points to their places (paper: Update)."""
     sigma_model: float = 0.25
     """Standard deviation of a cone's distance from a smooth curve (m), added in each detection."""
     sigma_along: float = 1.0
@@ -213,11 +209,11 @@ class CkfSettings(Positive):
     share of their spacing. A large value gives the filter as it is published, whose uncertainty multiplies
     with each extension."""
     sightings: int = 3
-    """Detections that make a landmark of the baseline filter; 1, as it is described, takes every one."""
+    """Detections that make a landmark of the baseline filter; its description has 1: every one."""
 
 
 @dataclass(frozen=True)
-class MapperSettings(Positive):
+class MapperSettings(Checked, group=""):
     """All settings of the estimators; each takes the groups that are its own."""
 
     lag: float = 3.0
@@ -229,14 +225,14 @@ class MapperSettings(Positive):
     steps_grown: int = 1
     """Gauss-Newton steps of a cycle in which a curve grew."""
     stations: bool = True
-    """Whether the cones of a closed map hold the vehicle along its curves; without, only across them."""
+    """Whether the cones of a closed map constrain the vehicle along its curves, not only across them."""
     noise: Literal["measured", "stated"] | None = None
     """Noise of odometry and detections: by default as stated, and measured where nothing is. Constant errors
     of the sensor are measured unless this is `stated`."""
     kind: Kind | None = None
     """What detections are of: cones, which stay where they are, or a line, whose points lie anywhere along
     it, on both sides or on one. By default the log states it, or its first seconds tell it; an online
-    estimator that is made without one takes cones, and a notice tells if they are of a line."""
+    estimator that is made without one takes cones, and a notice appears if they are of a line."""
     scale: float | None = None
     """Size of the scene by that of a Formula Student track: 0.1 for a model car of 1:10, 3 for a road. All
     lengths of the settings are those at scale 1. By default the first metres of the log tell it; an online
@@ -280,7 +276,7 @@ ODOMETRY_SIGMA = (0.25, 0.12, 0.035)
 
 
 def known_settings(settings: MapperSettings | None) -> MapperSettings:
-    """Return the settings of an estimator, by default the defaults; SettingsError for anything else."""
+    """Settings of an estimator, by default the defaults; SettingsError for anything else."""
     settings = MapperSettings() if settings is None else settings
     check_type("settings", settings, MapperSettings)
     return settings

@@ -1,15 +1,13 @@
-"""Settings of what is made of a map or a run: a speed profile, a recording for the live viewer, a film."""
+"""Settings of a speed profile, a recording for the live viewer, and a film."""
 
 from dataclasses import dataclass
 
-from pathspace_graph.settings.checked import Positive
+from .checked import Checked, Unlimited
 
 
 @dataclass(frozen=True)
-class SpeedSettings(Positive):
+class SpeedSettings(Checked):
     """How fast a vehicle may be on its tyres; the defaults are those of a careful Formula Student car."""
-
-    UNLIMITED = ("top",)
 
     lateral: float = 10.0
     """Largest lateral acceleration, m/s^2: the friction coefficient times gravity."""
@@ -17,12 +15,12 @@ class SpeedSettings(Positive):
     """Largest acceleration on a straight, m/s^2."""
     braking: float = 8.0
     """Largest deceleration on a straight, m/s^2."""
-    top: float = 30.0
+    top: Unlimited = 30.0
     """Largest speed, m/s."""
 
 
 @dataclass(frozen=True)
-class RecordingSettings(Positive):
+class RecordingSettings(Checked):
     """The recording of a run for the live viewer."""
 
     band_every: int = 10
@@ -33,10 +31,8 @@ class RecordingSettings(Positive):
 
 
 @dataclass(frozen=True)
-class FilmSettings(Positive):
+class FilmSettings(Checked):
     """The film of a run."""
-
-    UNLIMITED = ("laps",)
 
     seconds_per_lap: float = 10.0
     """Time of film for a lap, s."""
@@ -46,7 +42,7 @@ class FilmSettings(Positive):
     """Width of a frame, pixels."""
     height: int = 520
     """Height of a frame, pixels."""
-    laps: float = float("inf")
-    """Laps after which the film ends; the mapping goes on without it."""
+    laps: Unlimited = float("inf")
+    """Laps after which the film ends; the mapping continues."""
     hold: float = 2.0
     """Time for which the last frame is shown, s."""

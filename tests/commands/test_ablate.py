@@ -90,28 +90,6 @@ def test_the_command_takes_other_tracks_seeds_and_laps(
     assert frame["lap"].max() == 2
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["STUDY", "--jobs", "0"], "jobs: expected"),
-        (["STUDY", "--laps", "0"], "laps: expected"),
-        (["STUDY", "--baseline", "lag=2"], "--baseline: expected a variant or an estimator"),
-        (["STUDY", "--tracks", "none.yaml"], "none.yaml"),
-        (["lagg"], "the nearest is 'lag'"),
-        (["none.toml"], "none.toml"),
-    ],
-)
-def test_bad_usage_is_one_line_and_leaves_nothing(
-    options: list[str], says: str, file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    options = [option.replace("STUDY", str(file)) for option in options]
-    assert main(["ablate", *options, "--out", str(tmp_path / "out")]) == 2
-    printed = capsys.readouterr()
-    assert printed.err.count("\n") == 1
-    assert says in printed.err
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_command_refuses_the_folder_of_another_study(
     file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

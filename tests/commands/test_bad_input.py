@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,10 +19,7 @@ GOOD = {
     "truth_poses.csv": "t,x,y,theta\n0.0,0,0,0\n0.1,0.5,0,0\n0.2,1,0,0\n",
     "truth_cones.csv": "x,y,label\n5,1.5,left\n5.5,-1.5,right\n",
 }
-REQUIRED = ("log.toml", "odometry.csv", "detections.csv")
 TABLES = ("odometry.csv", "detections.csv", "truth_poses.csv", "truth_cones.csv")
-
-Change = Callable[[str], str]
 
 
 @pytest.fixture
@@ -52,22 +48,6 @@ def with_cell(text: str, row: int, column: str, value: str) -> str:
 
 def test_the_log_that_is_spoilt_below_is_a_good_one(log: Path) -> None:
     assert main(["online", str(log), "--out", str(log.parent / "map")]) == 0
-
-
-@pytest.mark.parametrize("name", REQUIRED)
-def test_a_missing_file(name: str, log: Path) -> None:
-    (log / name).unlink()
-    line = refusal(log)
-    assert str(log / name) in line
-    assert "expected" in line
-
-
-@pytest.mark.parametrize("name", GOOD)
-def test_an_empty_file(name: str, log: Path) -> None:
-    (log / name).write_text("")
-    line = refusal(log)
-    assert str(log / name) in line
-    assert "expected" in line
 
 
 @pytest.mark.parametrize(
@@ -99,94 +79,6 @@ def test_no_finite_number(name: str, column: str, value: str, log: Path) -> None
     assert f"{log / name}, row 3" in line
     assert "expected" in line
     assert f"'{column}'" in line
-
-
-def cell(row: int, column: str, value: str) -> Change:
-    return lambda text: with_cell(text, row, column, value)
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "says"),
-    [
-        ("odometry.csv", cell(4, "t", "0.05"), "row 4: expected a time later"),
-        ("odometry.csv", cell(4, "t", "0.1"), "row 4: expected a time later"),
-        ("odometry.csv", lambda text: text.splitlines()[0] + "\n", "expected at least one row"),
-        ("truth_poses.csv", cell(3, "t", "0.0"), "row 3: expected a time later"),
-        ("detections.csv", cell(4, "t", "0.05"), "row 4: expected a time"),
-        ("detections.csv", cell(2, "t", "-1"), "row 2: expected a time"),
-        ("detections.csv", cell(4, "t", "100"), "row 4: expected a time"),
-        ("detections.csv", cell(3, "xx", "0"), "row 3: expected a positive definite covariance"),
-        ("detections.csv", cell(3, "yy", "-0.01"), "row 3: expected a positive definite covariance"),
-        ("detections.csv", cell(3, "xy", "0.01"), "row 3: expected a positive definite covariance"),
-        ("detections.csv", lambda text: text + "0.2,1,2\n", "row 5: expected 7 fields, found 3"),
-        ("log.toml", lambda text: text.replace("log/1", "log/9"), "pathspace-log/1"),
-        ("log.toml", lambda text: text.replace("sigma", "sgima"), "sigma"),
-        ("log.toml", lambda text: text.replace("0.01]", "-0.01]"), "sigma"),
-        ("log.toml", lambda text: text.replace("0.01]", '"small"]'), "sigma"),
-        ("log.toml", lambda text: text + "a b\n", "row 4"),
-    ],
-)
-def test_what_else_is_refused(name: str, change: Change, says: str, log: Path) -> None:
-    (log / name).write_text(change(GOOD[name]))
-    line = refusal(log)
-    assert str(log / name) in line
-    assert says in line
-    assert "expected" in line
-
-
-def test_bytes_that_are_no_text(log: Path) -> None:
-    (log / "odometry.csv").write_bytes(b"t,vx,vy,wz\n\xff\xfe,1,2,3\n")
-    assert str(log / "odometry.csv") in refusal(log)
-
-
-def test_a_file_in_place_of_a_log(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["online", str(log / "log.toml"), "--out", str(log.parent / "map")]) == 2
-    line = capsys.readouterr().err
-    assert line.count("\n") == 1
-    assert "expected a log folder" in line
-
-
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("track.txt", "1 2\n"),
-        ("track.yaml", "cones: []\n"),
-        ("track.yaml", "7\n"),
-        ("track.csv", "a,b\n1,2\n"),
-    ],
-)
-def test_a_track_of_an_unknown_kind_names_the_known_ones(
-    name: str, text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / name).write_text(text)
-    assert main(["simulate", "--track", str(tmp_path / name), "--out", str(tmp_path / "log")]) == 2
-    line = capsys.readouterr().err
-    assert line.count("\n") == 1
-    assert str(tmp_path / name) in line
-    assert all(kind in line for kind in ("PacSim", "fssim", "EUFS", "TUM"))
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "says"),
-    [
-        ("map.json", "{", "row 1"),
-        ("map.json", "{}", "format"),
-        ("trajectory.tum", "0 1 2 0 0 0 0 1\n0.1 a 2 0 0 0 0 1\n", "row 2"),
-        ("trajectory.tum", "0 1 2\n", "row 1"),
-    ],
-)
-def test_a_bad_map_folder(
-    name: str, text: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "map.json").write_text('{"format": "pathspace-map/1", "closed": false, "boundaries": {}}')
-    (tmp_path / name).write_text(text)
-    assert main(["plot", str(tmp_path), "--out", str(tmp_path / "map.png")]) == 2
-    line = capsys.readouterr().err
-    assert line.count("\n") == 1
-    assert str(tmp_path / name) in line
-    assert says in line
-    assert not (tmp_path / "map.png").exists()
 
 
 @pytest.mark.parametrize(("command", "out"), [("online", "map"), ("batch", "map"), ("compare", "table")])

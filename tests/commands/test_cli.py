@@ -194,14 +194,6 @@ def test_a_huber_loss_without_a_limit_is_least_squares(
     assert read_map(tmp_path / "map").boundaries
 
 
-def test_a_second_run_keeps_the_earlier_result(tmp_path: Path) -> None:
-    assert simulate(tmp_path / "log") == 0
-    first = contents(tmp_path / "log")
-    assert simulate(tmp_path / "log", "--seed", "1") == 0
-    assert names(tmp_path) == {"log", "log.~1~"}
-    assert contents(tmp_path / "log.~1~") == first
-
-
 @pytest.mark.parametrize("command", ["online", "batch"])
 def test_a_boundary_across_the_drive_is_told_with_its_place_and_exit_code_3(
     command: str,
@@ -324,104 +316,6 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
 
 
 # --- usage -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["onlin"], "found 'onlin', the nearest is 'online'"),
-        (
-            ["online"],
-            "graph: online: expected LOG and --out PATH, found none (see pathspace-graph online --help)",
-        ),
-        (["export", "MAP", "--out", "F"], "export: expected --as centerline|tum|"),
-        (["online", "LOG", "--out", "--lag", "2"], "--out"),
-        (["online", "LOG", "--out", "MAP", "--lag", "long"], "--lag"),
-        (["online", "LOG", "--out", "MAP", "--no-such-option", "1"], "--no-such-option"),
-        (["online", "LOG", "--out", "MAP", "--estimatr", "ckf"], "the nearest is '--estimator' (see"),
-        (["online", "LOG", "--out", "MAP", "--estimator", "magic"], "fixed-lag"),
-        (["online", "LOG", "--out", "MAP", "--estimator", "magic"], "landmark-fixed-lag), found 'magic'\n"),
-        (
-            ["online", "LOG", "--out", "MAP", "--scale", "big"],
-            "graph: --scale: expected a number, found 'big' (see",
-        ),
-        (
-            ["online", "LOG", "--out", "MAP", "--max_poses=x"],
-            "--max-poses: expected a whole number, found 'x' (see",
-        ),
-        (["help", "onlin"], "found 'onlin', the nearest is 'online'"),
-        (["online", "LOG", "MAP", "--out", "X"], "online: expected one LOG, found 'LOG MAP' (see"),
-        (["online", "LOG", "--out", "MAP", "-o", "X"], "online: expected a known option, found '-o'"),
-        (
-            ["online", "LOG", "--out", "M", "--lag", "2", "--lag", "3"],
-            "--lag: expected it once, found it twice",
-        ),
-        (["online", "LOG", "--out", "MAP", "--keep-map=yes"], "--keep-map: expected a flag without a value"),
-        (["online", "LOG", "--out", "MAP", "--plot", "map.doc"], "map.doc: expected a file name that ends"),
-        (["simulate", "LOG", "--generate", "1"], "simulate: expected options only, found 'LOG' (see"),
-        (
-            ["simulate", "--generate", "9" * 20, "--out", "LOG"],
-            "--generate: expected whole numbers up to 9223",
-        ),
-        (["online", "LOG", "--out"], "graph: --out: expected a path, found none (see"),
-        (
-            ["online", "LOG", "--out", "MAP", "--noise", "x"],
-            "--noise: expected one of measured, stated, found 'x'",
-        ),
-        (
-            ["convert", "BAG", "--out", "LOG", "--sigma-odometry", "1", "2"],
-            "graph: --sigma-odometry: expected 3 numbers, found '1 2' (see",
-        ),
-        (
-            ["convert", "BAG", "--out", "LOG", "--mounting", "1", "-2", "a"],
-            "graph: --mounting: expected 3 numbers, found '1 -2 a' (see",
-        ),
-        (
-            ["scale", "--out", "D", "--estimators", "foo"],
-            "graph: --estimators: expected a known online estimator",
-        ),
-        (["zzz"], "report), found 'zzz'\n"),
-        (["online", "LOG", "--out", "MAP"], "LOG: expected a log folder"),
-        (
-            ["online", "LOG", "--out", "MAP", "--estimator", "ckf", "--save", "S"],
-            "--save: expected --estimator",
-        ),
-        (["online", "LOG", "--out", "MAP", "--resume", "S", "--lag", "2"], "--resume: expected no settings"),
-        (["online", "LOG", "--out", "MAP", "--save", "/"], "expected a file to write, found a folder"),
-        (["online", "LOG", "--out", "MAP", "--lag", "nan"], "lag: expected"),
-        (["online", "LOG", "--out", "MAP", "--lag", "-1"], "lag: expected"),
-        (["online", "LOG", "--out", "MAP", "--spline.degree", "0"], "spline.degree: expected"),
-        (["online", "LOG", "--out", "MAP", "--gauge.sigma-spacing", "inf"], "gauge.sigma_spacing: expected"),
-        (["online", "LOG", "--out", "MAP", "--gate.huber", "nan"], "gate.huber: expected a positive number"),
-        (["simulate", "--out", "LOG"], "--track FILE, --generate SEED or --event NAME"),
-        (
-            ["simulate", "--generate", "1", "--event", "skidpad", "--out", "LOG"],
-            "expected one of --track FILE",
-        ),
-        (["simulate", "--generate", "1", "--laps", "0", "--out", "LOG"], "laps"),
-        (["simulate", "--generate", "-1", "--out", "LOG"], "seed"),
-        (["simulate", "--generate", "1", "--out", "LOG", "--sensor.fov", "nan"], "sensor.fov"),
-        (["simulate", "--track", "none.yaml", "--out", "LOG"], "none.yaml"),
-        (["plot", "MAP", "--out", "map.doc"], ".png"),
-        (["plot", "MAP", "--out", "map.png"], "map.json"),
-        (["plot", "MAP", "--out", "map.png", "--band-scale", "0"], "--band-scale"),
-    ],
-)
-def test_bad_usage_is_one_line_and_exit_code_2(
-    arguments: list[str],
-    says: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    assert printed.err.count("\n") == 1
-    assert printed.err.startswith("pathspace-graph: ")
-    assert says in printed.err
-    assert names(tmp_path) == set()
 
 
 def test_the_output_is_checked_before_the_work(

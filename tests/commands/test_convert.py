@@ -66,23 +66,3 @@ def test_a_part_of_a_drive_is_cut_out(recorded: Path, tmp_path: Path) -> None:
     log, begin = read_log(tmp_path / "log"), camera_drive().odometry.t[0]
     assert log.odometry.t[0] >= begin + 2.0 and log.odometry.t[-1] <= begin + 8.0
     assert all(begin + 2.0 <= cycle.t <= begin + 8.0 for cycle in log.cycles)
-
-
-@pytest.mark.parametrize(
-    ("options", "complaint"),
-    [
-        (("--range-max", "0"), "--range-max: expected a positive number, found 0"),
-        (("--range-max", "inf"), "--range-max: expected a positive number, found inf"),
-        (("--start", "3", "--end", "2"), "--start, --end: expected times of at least 0 in this order"),
-        (("--time-offset", "nan"), "--time-offset: expected a number, found nan"),
-    ],
-)
-def test_numbers_without_a_meaning_are_refused(
-    recorded: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    options: tuple[str, ...],
-    complaint: str,
-) -> None:
-    run("convert", recorded, *OPTIONS, *options, "--out", tmp_path / "log", code=2)
-    assert complaint in capsys.readouterr().err

@@ -13,7 +13,7 @@ from pathspace_graph.cli import main
 from pathspace_graph.io.map import Map, map_to_json
 from pathspace_graph.io.results import write_trajectory
 
-from ..scenes.maps import open_map, point_map, ring_map
+from ..scenes.maps import open_map, ring_map
 
 WITHIN = 20.0  # radius of a drive between the boundaries of the ring (m)
 ORIGIN = ["--origin", "-33.9", "-151.2", "-30"]
@@ -49,31 +49,6 @@ def test_a_minus_is_standard_output(tmp_path: Path, capfdbinary: pytest.CaptureF
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--as", "geojson"], "--origin: expected LATITUDE LONGITUDE HEADING in degrees"),
-        (["--as", "points", "--stop"], "--start-speed, --stop: expected --as profile"),
-        (["--as", "lanelet2"], "which --as lanelet2 needs"),
-        (["--as", "lanelet2", "--origin", "95", "0", "0"], "expected a latitude"),
-        (["--as", "points", "--step", "0"], "--step: expected a number of at least"),
-        (["--as", "points", "--step", "nan"], "--step: expected a number of at least"),
-        (["--as", "centerline"], "map.json: a centre line: expected a curve as left boundary"),
-        (["--as", "lanelet2", *ORIGIN], "map.json: lanelet2: expected a curve as left boundary"),
-        (["--as", "word"], "--as"),
-    ],
-)
-def test_bad_usage_ends_in_one_line_and_leaves_nothing(
-    arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source, out = folder(tmp_path / "map", point_map()), tmp_path / "new" / "out"
-    assert main(["export", str(source), "--out", str(out), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert error.count("\n") == 1
-    assert not out.parent.exists()
-
-
 @pytest.mark.parametrize("kind", ["centerline", "profile", "geojson", "lanelet2"])
 def test_no_way_is_exported_where_the_drive_crosses_a_boundary(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -94,11 +69,3 @@ def test_no_way_is_exported_where_the_drive_crosses_a_boundary(
     path[:, :2] *= WITHIN / radius[:, None]
     write_trajectory(source / "smoothed.tum", angles, path)
     assert main(["export", str(source), "--as", kind, "--out", str(tmp_path / "good"), *ORIGIN]) == 0
-
-
-def test_a_map_without_a_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source, out = folder(tmp_path / "map", ring_map()), tmp_path / "out"
-    (source / "trajectory.tum").unlink()
-    assert main(["export", str(source), "--as", "tum", "--out", str(out)]) == 2
-    assert "trajectory.tum: expected a trajectory, found none" in capsys.readouterr().err
-    assert not out.exists()

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathspace_graph.batch import joint_mapper
 from pathspace_graph.batch.placement import OTHER_TRACK
 from pathspace_graph.cli import main
 from pathspace_graph.commands.estimate import unique_names
@@ -54,31 +53,3 @@ def test_several_logs_give_one_map_and_a_trajectory_for_each(
 def test_logs_of_one_name_are_told_apart(tmp_path: Path) -> None:
     folders = [tmp_path / part for part in ("day1/run", "day2/run", "day2/run-2", "day3/run")]
     assert list(unique_names(folders)) == ["run", "run-2", "run-2-2", "run-3"]
-
-
-@pytest.mark.parametrize(
-    ("logs", "options", "why"),
-    [
-        ([], [], "batch: expected LOG, found none"),
-        (
-            ["a", "b"],
-            ["--estimator", "landmark-batch"],
-            "expected spline for several logs, found",
-        ),
-        (["a", "nowhere"], [], "nowhere: expected a log folder, found none"),
-    ],
-)
-def test_what_cannot_be_mapped_together_is_refused(
-    folder: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    logs: list[str],
-    options: list[str],
-    why: str,
-) -> None:
-    monkeypatch.delattr(joint_mapper, "place_all")  # it ends before
-    command = ["batch", *(str(folder / name) for name in logs), "--out", str(tmp_path / "map"), *options]
-    assert main(command) == 2
-    assert why in capsys.readouterr().err
-    assert not (tmp_path / "map").exists()

@@ -10,7 +10,6 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.commands.known import read_known_map
-from pathspace_graph.errors import InputError
 from pathspace_graph.io.log import write_log
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import read_trajectory
@@ -77,32 +76,6 @@ def test_on_another_track_the_map_of_its_own_road_is_written(
     assert (out / "map.json").exists()
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (["--start", "0", "0", "0"], "--start: expected --on MAP as well, found none"),
-        (["--keep-map"], "--keep-map: expected --on MAP as well, found none"),
-        (["--on", "MAP", "--estimator", "ckf"], "--on: expected --estimator fixed-lag, found ckf"),
-        (
-            ["--on", "MAP", "--resume", "FILE"],
-            "--on: expected no --resume, since a saved mapper has its own map",
-        ),
-        (["--on", "nowhere"], "nowhere: expected a map's folder, a track file, skidpad or acceleration"),
-        (["--on", "MAP", "--start", "1", "2"], "--start: expected 3 numbers"),
-        (["--on", "MAP", "--map-sigma", "0"], "--map-sigma: expected a positive number, found 0"),
-    ],
-)
-def test_options_that_contradict_each_other_are_refused_in_a_line(
-    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], expected: str
-) -> None:
-    options = [str(drives / "map") if word == "MAP" else word for word in options]
-    assert main(["online", str(drives / "laps"), "--out", str(tmp_path / "out"), *options]) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert expected in lines[0]
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize("event", [skidpad, acceleration])
 def test_the_events_of_the_rules_are_known_by_name(event: object) -> None:
     track = event()  # type: ignore[operator]
@@ -124,12 +97,6 @@ def test_a_track_file_is_a_known_map() -> None:
     assert known.start is None
     left = known.map.boundaries[LEFT]
     np.testing.assert_allclose(np.diag(left.covariance), 0.15**2)
-
-
-def test_a_file_that_is_no_track_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(InputError, match="expected a track file of a known kind"):
-        read_known_map(tmp_path / "notes.txt", 0.15, MapperSettings())
 
 
 def test_a_drive_of_the_acceleration_needs_no_start(tmp_path: Path) -> None:

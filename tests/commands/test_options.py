@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.cli import BROKEN_PIPE, main, parse_command
-from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import write_json
-from pathspace_graph.io.overrides import leaves, override
+from pathspace_graph.io.overrides import leaves
 from pathspace_graph.options import help as help_texts
 from pathspace_graph.options.help import ESSENTIAL
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
@@ -140,31 +139,6 @@ def test_a_bad_summary_is_one_line_too(
     assert capsys.readouterr().err.startswith(f"pathspace-graph: {file}")
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--settings"], "--settings: expected a path, found none"),
-        (["--settings", "--lag", "3"], "--settings: expected a path, found none"),
-        (["--settings", "a.toml", "--settings", "b.toml"], "--settings: expected it once, found it twice"),
-        (["--settings", "none.toml"], "none.toml: expected a file of settings, found none"),
-    ],
-)
-def test_options_that_are_wrong_are_one_line(
-    options: list[str], says: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["online", *ONLINE, *options]) == 2
-    error = capsys.readouterr().err
-    assert says in error
-    assert error.count("\n") == 1
-
-
-def test_a_setting_is_only_named_where_it_is_near() -> None:
-    with pytest.raises(SettingsError, match=r"found 'gate.chii', the nearest is 'gate.chi'$"):
-        override(MapperSettings(), {"gate.chii": 3.0}, "")
-    with pytest.raises(SettingsError, match=r"found 'film.brightness'$"):
-        override(MapperSettings(), {"film.brightness": 3.0}, "")
-
-
 def test_the_estimators_have_few_settings() -> None:
     """A number that neither a user nor a study changes is a constant."""
     assert len(leaves(MapperSettings())) <= MOST_SETTINGS
@@ -216,14 +190,6 @@ def test_the_shell_completes_commands_and_options(capsys: pytest.CaptureFixture[
     assert completed("online", "LOG", "--estimator", "ck") == ["ckf"]
     assert completed("export", "MAP", "--as", "la") == ["lanelet2"]
     assert completed("ablate", "degr") == ["degree"]
-
-
-def test_an_option_that_is_called_otherwise_than_its_field_is_shown_so(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert main(["export", "--help"]) == 0
-    shown = capsys.readouterr().out
-    assert "--as" in shown and "--format" not in shown
 
 
 def test_a_reader_that_has_seen_enough_is_no_error(

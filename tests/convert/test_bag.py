@@ -658,13 +658,13 @@ def test_a_wrong_topic_lists_all_with_types_counts_and_rates(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--odometry", "/odom", "--detections", "/odom"], "supported is what has a point cloud"),
+        (["--odometry", "/odom", "--detections", "/odom"], "supported are messages with a point cloud"),
         ([*TOPICS, "--label-field", "klass"], "in the field 'klass', found x, y, label"),
         ([*TOPICS, "--labels", "blue=0"], "--labels: expected LABEL=VALUE"),
-        ([*TOPICS, "--mounting", "0", "0", "90"], "--mounting: expected X Y YAW in m, m and rad"),
+        ([*TOPICS, "--mounting", "0", "0", "90"], "mounting: expected a yaw of at most 2 pi rad, found 90"),
         ([*TOPICS, "--definition", "cone.txt"], "cone.txt"),
         ([*TOPICS, "--sigma-range", "0"], "sigma_range: expected a positive number"),
-        ([*TOPICS, "--sigma-odometry", "1", "0", "1"], "--sigma-odometry: expected three positive numbers"),
+        ([*TOPICS, "--sigma-odometry", "1", "0", "1"], "sigma_odometry: expected a positive number, found 0"),
         (
             [*TOPICS, "--start", "9"],
             "found none; 11 odometry samples outside --start and --end were left out",

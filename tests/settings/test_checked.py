@@ -6,13 +6,16 @@ import re
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
 from math import inf, nan
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.options.map import Online
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.sensor import OdometryNoise
 
 UNLIMITED = {
     "gate.huber",
@@ -90,3 +93,11 @@ def test_a_setting_of_a_wrong_type_is_named(wrong: dict[str, Any], line: str) ->
 
 def test_numbers_of_numpy_are_numbers() -> None:
     assert MapperSettings(lag=np.float64(2.0), steps=np.int64(2)).lag == 2.0
+
+
+def test_a_rule_of_a_tuple_holds_for_each_number_and_none_holds_without_it() -> None:
+    assert OdometryNoise(slow=(0.0, 1.0, 0.0)).slow[0] == 0.0
+    with pytest.raises(SettingsError, match=r"^odometry.white: expected a positive number, found 0.0$"):
+        OdometryNoise(white=(1.0, 0.0, 1.0))
+    place = Online(log=Path("log"), out=Path("map"), start=(0.0, -1.0, 0.0))
+    assert place.start == (0.0, -1.0, 0.0)

@@ -152,8 +152,7 @@ def test_the_command_takes_presets_and_single_options_beside_them(tmp_path: Path
 def test_without_presets_a_log_says_nothing_of_them(tmp_path: Path) -> None:
     log = command(tmp_path / "log", "--sensor", "plain")
     assert log.truth is not None and log.truth.sensor is None and log.truth.noise is None
-    assert set(log.source) == {"track", "seed", "settings"}
-    assert "slow" not in log.source["settings"]
+    assert set(log.source) == {"track", "seed", "laps"}
 
 
 def test_presets_are_of_their_groups_only() -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.log import Log, Truth, read_log, write_log
+from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.sim.sensor import ConeSensor, OdometryNoise, SensorSettings, measure_twists
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -62,29 +61,6 @@ def true_points(log: Log) -> tuple[np.ndarray, np.ndarray]:
     truth, cones = truth_of(log)
     real = cones >= 0
     return real, in_vehicle(truth.cones[cones[real]], rows(log)[3][real])
-
-
-def files(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
-def test_a_seed_gives_the_same_log_to_the_byte(track: Track, tmp_path: Path) -> None:
-    settings = SimulationSettings(laps=1)
-    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        write_log(simulate(track, settings, seed), tmp_path / name)
-    assert files(tmp_path / "a") == files(tmp_path / "b")
-    for name in ("odometry.csv", "detections.csv", "truth_poses.csv"):
-        assert files(tmp_path / "a")[name] != files(tmp_path / "c")[name]
-
-
-def test_simulated_log_survives_the_round_trip(log: Log, tmp_path: Path) -> None:
-    write_log(log, tmp_path / "log")
-    read = read_log(tmp_path / "log")
-    np.testing.assert_array_equal(read.odometry.twist, log.odometry.twist)
-    assert [cycle.t for cycle in read.cycles] == [cycle.t for cycle in log.cycles]
-    for one, other in zip(rows(read), rows(log), strict=True):
-        np.testing.assert_array_equal(one, other)
-    np.testing.assert_array_equal(truth_of(read)[1], truth_of(log)[1])
 
 
 def test_rates_frames_and_first_pose(log: Log, track: Track) -> None:

@@ -120,7 +120,7 @@ def test_all_estimators() -> None:
         ("tracks = [-1]", "tracks: expected whole numbers"),
         ("tracks = [0]\nseeds = 3", "seeds: expected a list"),
         ("tracks = [0]\nseeds = [0.5]", "seeds: expected whole numbers"),
-        ("tracks = [0]\nlaps = 0", "laps: expected at least 1"),
+        ("tracks = [0]\nlaps = 0", "laps: expected a positive number"),
         ("tracks = [0]\nlaps = true", "laps: expected a whole number"),
         ("tracks = [0]\nlap = 1", "found 'lap', the nearest is 'laps'"),
         ("tracks = [0]\nname = 1", "name: expected text"),
