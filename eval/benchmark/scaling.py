@@ -31,8 +31,8 @@ from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .lanes import CONES, LAPS, POINT, READINGS, SLOPE, Sweep, memory_rows, sweep_rows
-from .roads import Drives, first_cycles
+from .lanes import CONES, DENSE_LINE, LAPS, POINT, READINGS, SLOPE, Sweep, memory_rows, sweep_rows
+from .roads import LINE_POINTS, Drives, first_cycles
 
 MARKER: Final = "scaling.json"  # file by which a folder of results is known
 COMPARED_AT: Final = 200.0  # number of cones at which estimators are compared, that of an ordinary track
@@ -72,6 +72,11 @@ class Scaling:
         at, seconds = np.log(points["at"]), np.log(points["seconds"])
         return float(np.exp(np.interp(np.log(cones), at, seconds, left=np.nan, right=np.nan)))
 
+    def seconds_on_line(self, estimator: str) -> float:
+        """Return the mean update (s) on dense lines; NaN where the estimator was stopped."""
+        stopped = self.slope(DENSE_LINE, estimator)["stopped"]
+        return float("nan") if stopped else float(self.of(DENSE_LINE, estimator)["seconds"].iloc[0])
+
 
 def measure_scaling(
     estimators: Sequence[str],
@@ -81,7 +86,7 @@ def measure_scaling(
     folder: Path | None = None,
     on_cycle: OnCell = lambda *_: None,
 ) -> Scaling:
-    """Measure all three sweeps, and the memory, each kept in a folder at once, or read from there.
+    """Measure all sweeps, and the memory, each kept in a folder at once, or read from there.
 
     `on_cycle` gets the numbers of cycles that are done, and of all that remained.
     """
@@ -120,7 +125,7 @@ def scaling_figures(scaling: Scaling) -> tuple[tuple[str, ...], dict[str, list[t
     header = (
         *("estimator", f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})", "slope, readings"),
         *(f"ms at {COMPARED_AT:g} cones", f"{first} / this", "most cones"),
-        *("ms, lap 2", f"ms, lap {settings.laps}", "peak MB"),
+        *("ms, lap 2", f"ms, lap {settings.laps}", f"ms, {LINE_POINTS} points of lines", "peak MB"),
     )
     rows = {}
     for name in scaling.estimators:
@@ -129,6 +134,7 @@ def scaling_figures(scaling: Scaling) -> tuple[tuple[str, ...], dict[str, list[t
         at, laps = scaling.seconds_at(COMPARED_AT, name), scaling.of(LAPS, name).set_index("at")["seconds"]
         alone = [1e3 * at, scaling.seconds_at(COMPARED_AT, first) / at, scaling.of(CONES, name)["at"].max()]
         alone += [1e3 * laps.get(float(lap), math.nan) for lap in (2, settings.laps)]
+        alone.append(1e3 * scaling.seconds_on_line(name))
         rows[name] = [*both, *((float(value), math.nan) for value in (*alone, scaling.memory[name]))]
     return header, rows
 
@@ -136,11 +142,13 @@ def scaling_figures(scaling: Scaling) -> tuple[tuple[str, ...], dict[str, list[t
 def scaling_table(scaling: Scaling) -> TextTable:
     """Return a row for each estimator: slopes, times, the ratio to the first, laps and memory."""
     header, found = scaling_figures(scaling)
-    header, rows = (*header[:6], f"ms, lap 2 and {scaling.settings.laps}", header[8]), []
+    header, rows = (*header[:6], f"ms, lap 2 and {scaling.settings.laps}", *header[8:]), []
     for name, row in found.items():
-        digits = (2, 2, 1, 2, 0, 1, 1, 1)
-        *cells, second, last, peak = (_number(*of, places) for of, places in zip(row, digits, strict=True))
-        rows.append((name, *cells, f"{second}, {last}", peak))
+        digits = (2, 2, 1, 2, 0, 1, 1, 1, 1)
+        *cells, second, last, line, peak = (
+            _number(*of, places) for of, places in zip(row, digits, strict=True)
+        )
+        rows.append((name, *cells, f"{second}, {last}", line, peak))
     return TextTable("Time per update: slopes of the logarithms, +- standard error", header, tuple(rows))
 
 
