@@ -219,9 +219,10 @@ def timed_wait(estimator: OnlineEstimator) -> float:
 def timed_update(
     estimator: OnlineEstimator, odometry: Odometry, detections: Detections
 ) -> tuple[CycleResult, float, float]:
-    begin, worked = time.perf_counter(), time.thread_time()
+    worked, begin = time.thread_time(), time.perf_counter()
     estimate = estimator.update(odometry, detections)
-    return estimate, time.perf_counter() - begin, time.thread_time() - worked
+    seconds = time.perf_counter() - begin
+    return estimate, seconds, time.thread_time() - worked
 
 
 @contextmanager

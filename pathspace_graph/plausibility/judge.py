@@ -12,6 +12,7 @@ from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.front_end.kind import kind_of
+from pathspace_graph.front_end.scan_matching import MIN_MATCHED
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.io.parsing import read_table, shown
@@ -27,6 +28,7 @@ from .hint import Hint, because, hint_of
 from .hypotheses import AS_WRITTEN, DEGREE, Hypothesis, Mounting, Pairs, Trial, Trials, far_better
 
 LEAST_TWISTS: Final = 20  # least number of twists for hints
+LEAST_CYCLES: Final = 100  # least number of cycles whose typical number of detections tells the sensor's
 PAIR_OVERLAP: Final = 0.5  # least share of detections in view of both cycles of a compared pair
 SHORTEST_STEP: Final = 2e-4  # shortest usual time between rows (s)
 LONGEST_STEP: Final = 5.0  # longest usual time between rows (s)
@@ -87,7 +89,7 @@ def _hints(log: Log) -> list[Hint]:
     of_clocks = one_clock(log)
     if of_clocks:
         return found + of_clocks
-    of_ends = ends_apart(log)
+    of_ends = ends_apart(log) + few_detections(log)
     log, of_positions = positions_in_metres(log)
     found += of_positions
     pairs = hypotheses.pairs_of(log.cycles)
@@ -159,6 +161,14 @@ def ends_apart(log: Log) -> list[Hint]:
     if driven.size and driven[-1] - end > WITHOUT_DETECTIONS:
         found.append(hint_of("detections end early", seconds=t[-1] - end))
     return found
+
+
+def few_detections(log: Log) -> list[Hint]:
+    """Return a hint if the typical cycle has too few detections for scan matching to check the odometry."""
+    counts = np.array([len(cycle.labels) for cycle in log.cycles])
+    if len(counts) < LEAST_CYCLES or _median(counts) >= MIN_MATCHED:
+        return []
+    return [hint_of("few detections", count=_median(counts), least=MIN_MATCHED)]
 
 
 def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:

@@ -65,6 +65,15 @@ def test_detections_that_are_stamped_too_early_are_told() -> None:
     assert (found.cause, found.likely) == ("clocks", "the detections are stamped about 0.5 s too early")
 
 
+@pytest.mark.parametrize(("most", "told"), [(2, True), (3, False)])
+def test_a_sensor_that_sees_too_few_cones_to_check_the_odometry_is_told(most: int, told: bool) -> None:
+    log = short_drive()
+    few = replace(log, cycles=tuple(c.where(np.arange(len(c.labels)) < most) for c in log.cycles))
+    assert np.median([len(cycle.labels) for cycle in few.cycles]) == most
+    found = [hint.found for hint in hints(few) if hint.cause == "reach"]
+    assert found == (["the typical cycle has 2 detections"] if told else [])
+
+
 def test_good_logs_are_not_accused() -> None:
     log = short_drive()
     colourless = replace(log, cycles=tuple(replace(c, labels=c.labels * 0 + UNKNOWN) for c in log.cycles))
