@@ -20,12 +20,14 @@ from pathspace_graph.run import split_odometry, timed_update, timed_wait
 from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .roads import Drives
+from .roads import LINE_POINTS, Drives
 
-Sweep = Literal["cones", "readings", "laps"]  # cones seen, detections of an update, or lap
+Sweep = Literal["cones", "readings", "laps", "line"]
+"""Varied: cones seen, detections of an update, or lap. On a line, 300 points in each update."""
 CONES: Final[Sweep] = "cones"
 READINGS: Final[Sweep] = "readings"
 LAPS: Final[Sweep] = "laps"
+DENSE_LINE: Final[Sweep] = "line"
 POINT: Final = ["sweep", "estimator", "at", "seconds", "cycles", "size"]  # columns of a point of a sweep
 SLOPE: Final = [*POINT[:2], "slope", "error", "points", "low", "high", "stopped"]  # and of its slope
 JUDGED: Final = 10  # number of updates whose mean is compared with the budget
@@ -135,6 +137,9 @@ def lanes_of(
         lap = 1.0 + np.searchsorted(drives.lap_ends, [seen.t for seen in drives.laps.cycles])
         edges = np.arange(1.0, len(drives.lap_ends) + 2.0)
         return [Lane(name, drives.laps, lap.astype(float)) for name in estimators], edges, 2.0
+    if sweep == DENSE_LINE:
+        at = np.full(len(drives.line.cycles), float(LINE_POINTS))
+        return [Lane(name, drives.line, at) for name in estimators], np.array([LINE_POINTS, np.inf]), 0.0
     lanes = []
     for wanted, log in drives.readings.items():
         counts = np.array([len(seen.labels) for seen in log.cycles])

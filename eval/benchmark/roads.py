@@ -1,7 +1,7 @@
-"""Roads and drives to measure time by: ever more cones, ever more detections, and lap after lap."""
+"""Roads and drives to measure time by: more and more cones or detections, lap after lap, and dense lines."""
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.random import Generator
@@ -11,12 +11,15 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.io.log import Log
 from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.sim.curves import along_polyline, arc_lengths, left_normals, unit
+from pathspace_graph.sim.lines import LINE, LineSettings
 from pathspace_graph.sim.sensor import SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
 from pathspace_graph.sim.vehicle import VehicleSettings
 
 GAP, DENSE_GAP, DENSE_RANGE = 5.0, 1.0, 30.0  # distances of cones in a row, and dense with its range (m)
+LINE_POINTS: Final = 300  # points of both lines in a cycle, in the mean
+LINE_SPACING: Final = 0.2  # distance of a cycle's points along each line, which gives that many (m)
 WIDTH: Final = 4.0  # distance of the rows (m)
 SWING, WAVELENGTH = 0.9, 300.0  # largest turn from a road's direction (rad), and length of a swing (m)
 DENT, DENTS = 0.12, 3  # share of the radius by which a closed road leaves its circle, and how often it does
@@ -40,22 +43,28 @@ QUICK: Final = ScalingSettings(  # takes less than a minute; its slopes mean lit
 
 @dataclass(frozen=True, eq=False)
 class Drives:
-    """Logs of the three sweeps."""
+    """Logs of the sweeps."""
 
     cones: Log  # long road up to the last cone asked for
     seen: Array  # (n,) number of cones seen by the end of each cycle
     readings: dict[int, Log]  # a short dense road, by the number of detections in a cycle
     laps: Log  # closed road
     lap_ends: Array  # (m,) stamps at which its laps end (s)
+    line: Log  # two laps of the closed road between dense lines
 
     @property
     def by_sweep(self) -> dict[str, list[Log]]:
         """Return the logs of each sweep, which are driven in turn."""
-        return {"cones": [self.cones], "readings": [*self.readings.values()], "laps": [self.laps]}
+        return {
+            "cones": [self.cones],
+            "readings": [*self.readings.values()],
+            "laps": [self.laps],
+            "line": [self.line],
+        }
 
     @property
     def cycles(self) -> int:
-        """Return the number of cycles of all three sweeps together."""
+        """Return the number of cycles of all sweeps together."""
         return sum(max(len(log.cycles) for log in logs) for logs in self.by_sweep.values())
 
 
@@ -64,11 +73,15 @@ def make_drives(settings: ScalingSettings) -> Drives:
     long = drive_log(open_road(int(settings.cones_max), GAP), seed)
     seen = cones_seen(long)
     count = int(np.searchsorted(seen, settings.cones_max)) + 1
-    dense = drive_log(open_road(settings.readings_cones, DENSE_GAP), seed, dense=True)
+    dense_road, far = open_road(settings.readings_cones, DENSE_GAP), SensorSettings(range_max=DENSE_RANGE)
+    dense = drive_log(dense_road, seed, sensor=far)
     rng = np.random.default_rng(seed)
-    laps = drive_log(closed_road(settings.laps_cones), seed, settings.laps)
     readings = {k: thinned(dense, k, rng) for k in settings.readings}
-    return Drives(first_cycles(long, count), seen[:count].astype(float), readings, laps, lap_times(laps))
+    closed, sensor = closed_road(settings.laps_cones), replace(LINE, range_max=DENSE_RANGE)
+    laps = drive_log(closed, seed, settings.laps)
+    line = drive_log(closed, seed, 2, sensor=sensor, line=LineSettings(LINE_SPACING))
+    cones = first_cycles(long, count)
+    return Drives(cones, seen[:count].astype(float), readings, laps, lap_times(laps), line)
 
 
 def open_road(cones: int, gap: float) -> Track:
@@ -105,11 +118,10 @@ def _with_rows(middle: Array, gap: float, closed: bool) -> Track:
     return Track(rows[0], rows[1], np.zeros((0, 2)), closed, start, "road")
 
 
-def drive_log(track: Track, seed: int, laps: int = 1, dense: bool = False) -> Log:
-    """Simulate a drive along a road at full speed from the start on."""
+def drive_log(track: Track, seed: int, laps: int = 1, **sensing: Any) -> Log:
+    """Simulate a drive along a road at full speed from the start on; `sensing` sets sensor and line."""
     vehicle = VehicleSettings(speed_max=SPEED, speed_start=SPEED, acceleration_lateral=LATERAL)
-    sensor = SensorSettings(range_max=DENSE_RANGE) if dense else SensorSettings()
-    return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, sensor=sensor), seed)
+    return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, **sensing), seed)
 
 
 def cones_seen(log: Log) -> IntArray:

@@ -32,8 +32,8 @@ from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .lanes import CONES, LAPS, POINT, READINGS, SLOPE, Sweep, memory_rows, sweep_rows
-from .roads import Drives, first_cycles
+from .lanes import CONES, DENSE_LINE, LAPS, POINT, READINGS, SLOPE, Sweep, memory_rows, sweep_rows
+from .roads import LINE_POINTS, Drives, first_cycles
 
 MARKER: Final = "scaling.json"  # file by which a folder of results is known
 COMPARED_AT: Final = 200.0  # number of cones at which estimators are compared, that of an ordinary track
@@ -73,6 +73,11 @@ class Scaling:
         at, seconds = np.log(points["at"]), np.log(points["seconds"])
         return float(np.exp(np.interp(np.log(cones), at, seconds, left=np.nan, right=np.nan)))
 
+    def seconds_on_line(self, estimator: str) -> float:
+        """Return the mean update (s) on dense lines; NaN where the estimator was stopped."""
+        stopped = self.slope(DENSE_LINE, estimator)["stopped"]
+        return float("nan") if stopped else float(self.of(DENSE_LINE, estimator)["seconds"].iloc[0])
+
 
 def measure_scaling(
     estimators: Sequence[str],
@@ -82,7 +87,7 @@ def measure_scaling(
     folder: Path | None = None,
     on_cycle: OnCell = lambda *_: None,
 ) -> Scaling:
-    """Measure all three sweeps, and the memory, each kept in a folder at once, or read from there.
+    """Measure all sweeps, and the memory, each kept in a folder at once, or read from there.
 
     `on_cycle` gets the numbers of cycles that are done, and of all that remained.
     """
@@ -121,7 +126,7 @@ def scaling_table(scaling: Scaling) -> Table:
     header = (
         *("estimator", f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})", "slope, readings"),
         *(f"ms at {COMPARED_AT:g} cones", f"{first} / this", "most cones"),
-        *("ms, lap 2", f"ms, lap {settings.laps}", "peak MB"),
+        *("ms, lap 2", f"ms, lap {settings.laps}", f"ms, {LINE_POINTS} points of lines", "peak MB"),
     )
     rows = []
     for name in scaling.estimators:
@@ -130,7 +135,8 @@ def scaling_table(scaling: Scaling) -> Table:
         at, laps = scaling.seconds_at(COMPARED_AT, name), scaling.of(LAPS, name).set_index("at")["seconds"]
         alone = [1e3 * at, scaling.seconds_at(COMPARED_AT, first) / at, scaling.of(CONES, name)["at"].max()]
         alone += [1e3 * laps.get(float(lap), math.nan) for lap in (2, settings.laps)]
-        rows.append((name, *both, *Quantity.row([*alone, scaling.memory[name]], 1, 2, 0, 1, 1, 1)))
+        alone += [1e3 * scaling.seconds_on_line(name), scaling.memory[name]]
+        rows.append((name, *both, *Quantity.row(alone, 1, 2, 0, 1, 1, 1, 1)))
     return Table(header, tuple(rows), "Time per update: slopes of the logarithms, ± standard error")
 
 

@@ -17,8 +17,13 @@ from pathspace_graph.factors.se2 import left_of, rotation, to_map
 from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.mapper import MapperSettings
 
+MOST_DOUBLINGS: Final = 1 << 6  # of the side of a cell
 MOST_CELLS: Final = 1 << 20  # in a row of cells, which is more than any sensor sees
 MERGE_CELL: Final = 1.0  # side of the cells (m) in which points are merged: 5 mm beside an arc of 9 m
+MERGE_RANGE: Final = 12.0
+"""Range (m) beyond which the side doubles, and doubles again at each double of it.
+
+Noise grows with the range, so a sensor that sees three times as far needs hardly more points."""
 LINE_REACH: Final = 1.5  # reach of a line by that of a cone: its points are spread over the gap of points
 LEAST_POINTS: Final = 2.0  # least sum of weights of the points that tell a line
 LEAST_SPREAD: Final = 0.3  # least standard deviation of these along the line, by the reach
@@ -44,8 +49,10 @@ def merged(detections: Detections, is_line: BoolArray) -> Detections:
     if not is_line.any():
         return detections
     line = detections.where(is_line)
-    column, row = np.floor(line.points_vehicle / MERGE_CELL).astype(np.intp).T
-    keys = (line.labels * MOST_CELLS + column) * MOST_CELLS + row
+    doublings = np.maximum(np.frexp(np.hypot(*line.points_vehicle.T) / MERGE_RANGE)[1], 0)
+    side = np.ldexp(MERGE_CELL, doublings)
+    column, row = np.floor(line.points_vehicle.T / side).astype(np.intp)
+    keys = ((line.labels * MOST_DOUBLINGS + doublings) * MOST_CELLS + column) * MOST_CELLS + row
     _, first, cell, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
     points = _means(line.points_vehicle, cell, counts)
     covariances = _means(line.covariances.reshape(-1, 4), cell, counts) / counts[:, None]

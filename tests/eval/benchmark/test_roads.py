@@ -10,6 +10,7 @@ from pathspace_graph.eval.benchmark.roads import (
     DENT,
     DENTS,
     GAP,
+    LINE_POINTS,
     SPARE,
     SWING,
     WAVELENGTH,
@@ -104,3 +105,5 @@ def test_the_long_drive_ends_when_the_last_cone_is_seen() -> None:
     assert drives.seen[-1] >= SMALL.cones_max > drives.seen[-2]
     assert set(drives.readings) == set(SMALL.readings)
     assert len(drives.lap_ends) == SMALL.laps
+    points = [len(cycle.labels) for cycle in drives.line.cycles]
+    assert np.mean(points) == pytest.approx(LINE_POINTS, rel=0.1)

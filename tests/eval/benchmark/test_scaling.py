@@ -10,8 +10,8 @@ import pytest
 
 from pathspace_graph import cli
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.benchmark.lanes import CONES, LAPS, READINGS
-from pathspace_graph.eval.benchmark.roads import make_drives
+from pathspace_graph.eval.benchmark.lanes import CONES, DENSE_LINE, LAPS, READINGS
+from pathspace_graph.eval.benchmark.roads import LINE_POINTS, make_drives
 from pathspace_graph.eval.benchmark.scaling import (
     MARKER,
     measure_scaling,
@@ -40,12 +40,15 @@ def test_a_small_measurement_end_to_end(tmp_path: Path) -> None:
     assert scaling.of(LAPS, "fixed-lag")["at"].tolist() == [1.0, 2.0]
     assert scaling.of(READINGS, "fixed-lag")["at"].tolist() == [2.0, 6.0, 12.0]
     assert len(scaling.of(CONES, "fixed-lag")) == 4
+    (on_line,) = scaling.of(DENSE_LINE, "fixed-lag").to_dict("records")
+    assert on_line["at"] == LINE_POINTS
+    assert on_line["cycles"] == len(drives.line.cycles)
     assert scaling.memory["fixed-lag"] > 0.01
     assert not stops(scaling)
     write_scaling(tmp_path / "out", scaling)
     content = json.loads((tmp_path / "out" / MARKER).read_text())
     assert content["seconds_compared"] == {"fixed-lag": None}  # 200 cones weren't reached
-    assert {s["sweep"] for s in content["slopes"]} == {CONES, READINGS, LAPS}
+    assert {s["sweep"] for s in content["slopes"]} == {CONES, READINGS, LAPS, DENSE_LINE}
     assert len(pd.read_csv(tmp_path / "out" / "points.csv")) == len(scaling.points)
     names = {"scaling.png", "laps.png", "table.md"}
     assert names <= {file.name for file in (tmp_path / "out").iterdir()}

@@ -82,6 +82,14 @@ def test_points_of_a_line_in_one_cell_become_their_mean() -> None:
     np.testing.assert_allclose(variances, [0.04, 0.04 / 3.0, 0.04, 0.04])
 
 
+def test_cells_double_with_the_range() -> None:
+    x = np.array([10.2, 11.2, 12.2, 13.8, 14.2, 24.2, 27.8, 28.2])
+    points = np.column_stack([x, np.full(8, 0.5)])
+    cycle = Detections(1.0, points, np.tile(0.04 * np.eye(2), (8, 1, 1)), np.full(8, LEFT))
+    found = np.sort(merged(cycle, np.ones(8, bool)).points_vehicle[:, 0])
+    np.testing.assert_allclose(found, [10.2, 11.2, 13.0, 14.2, 26.0, 28.2])
+
+
 def test_good_odometry_along_lines_is_not_doubted() -> None:
     log = line_drive(2, 0.5)
     front_end = FrontEnd(MapperSettings(kind="line"), log.noise)
