@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from io import BytesIO, TextIOWrapper
+from io import TextIOWrapper
 from itertools import chain, islice
 from pathlib import Path
 from reprlib import Repr
-from typing import Any, Final, NamedTuple, NoReturn, Self, TypeVar
+from typing import Any, BinaryIO, Final, NamedTuple, NoReturn, Self, TypeVar
 
 import msgspec
 import numpy as np
@@ -110,19 +110,25 @@ def _decoded(data: bytes, file: Path) -> str:
 
 def read_bytes(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> bytes:
     """Read the bytes of a file, at most `most`; an InputError says what was `expected`."""
+    with _opened(file, expected, most) as stream:
+        return stream.read()
+
+
+@contextmanager
+def _opened(file: Path, expected: str, most: int) -> Iterator[BinaryIO]:
+    """Open a file of at most `most` bytes; an InputError says what was `expected`."""
     try:
         found = file.stat()
         if not stat.S_ISREG(found.st_mode):  # a pipe would block where it is opened
             raise InputError(file, f"expected {expected}, found a folder, a device or a pipe")
+        if found.st_size > most:
+            raise InputError(file, f"expected at most {most} bytes, found more")
         with file.open("rb") as stream:
-            data = stream.read(min(found.st_size, most) + 1)  # whose room is reserved before it is read
+            yield stream
     except FileNotFoundError:
         raise InputError(file, f"expected {expected}, found none") from None
     except OSError as error:
         raise InputError(file, f"expected {expected}, can't be read ({error.strerror})") from None
-    if len(data) > most:
-        raise InputError(file, f"expected at most {most} bytes, found more")
-    return data
 
 
 @contextmanager
@@ -303,18 +309,20 @@ def read_table(
     tolerated. Of several `delimiters` it is the most frequent one in the header; where that is no comma,
     numbers may have a decimal comma.
     """
-    data = read_bytes(file, most=most)
-    stream = TextIOWrapper(BytesIO(data), _encoding(data), newline="")
-    try:
-        first = next(filter(str.strip, stream), "")
-        stream.seek(0)
-        reader = csv.reader(stream, delimiter=max(delimiters, key=first.count), skipinitialspace=True)
-        return _read_rows(file, reader, required, comment)
-    except csv.Error as error:
-        raise InputError(file, f"expected comma-separated values: {error}", reader.line_num) from error
-    except UnicodeDecodeError:
-        _decoded(data, file)  # which names the row
-        raise
+    with _opened(file, "a file", most) as binary:
+        stream = TextIOWrapper(binary, _encoding(binary.read(2)), newline="")
+        try:
+            stream.seek(0)
+            first = next(filter(str.strip, stream), "")
+            stream.seek(0)
+            reader = csv.reader(stream, delimiter=max(delimiters, key=first.count), skipinitialspace=True)
+            return _read_rows(file, reader, required, comment)
+        except csv.Error as error:
+            told = f"expected comma-separated values: {error}"
+            raise InputError(file, told, reader.line_num) from error
+        except UnicodeDecodeError:
+            read_text(file, most=most)  # which names the row
+            raise
 
 
 def _read_rows(
