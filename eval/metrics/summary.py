@@ -14,7 +14,7 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import Health, HealthStretch, counts, stretches
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
@@ -31,7 +31,6 @@ GATE: Final = ("dropped", "refused")  # counts of the gate in each cycle
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
     """Return the estimator, settings, versions, laps, timing, hints, and with truth the paper's metrics."""
-    seconds = [record.seconds for record in result.cycles]
     summary: dict[str, Any] = {
         "estimator": result.estimator,
         "settings": result.settings,
@@ -44,39 +43,50 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         "size": result.map.size,
         "not_mapped": not_mapped(result.map, log),
         "points": {NAMES[label]: own.size for label, own in sorted(result.map.points.items())},
-        "seconds": None,
         "gate": {name: sum(getattr(record, name) for record in result.cycles) for name in GATE},
+        **_cycles(result),
     }
-    if seconds:
-        p99 = float(np.quantile(seconds, 0.99))
-        summary["seconds"] = {"mean": float(np.mean(seconds)), "p99": p99, "max": max(seconds)}
-    if result.batches is not None:
-        summary["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
     if crossed := crossings_of(result):
         summary["crossings"] = [_crossing(one) for one in crossed]
     if hints:
         summary["hints"] = [vars(hint) for hint in hints]
-    told = [record for record in result.cycles if record.jump is not None or record.notice]
-    if told:
-        keys = ("cycle", "t", "jump", "notice")
-        summary["events"] = [{key: getattr(record, key) for key in keys} for record in told]
-    if any(record.health for record in result.cycles):
-        number = counts([health_of(record) for record in result.cycles])
-        summary["health"] = {**number, "stretches": [asdict(of) for of in stretches_of(result)]}
     if result.noise is not None:
         summary["noise"] = _noise(result.noise, log)
         notes = noise_lines(result.noise, result.scale)
         summary |= {"notes": notes} if notes else {}
-    state = result.vehicle
-    if state is not None:
-        summary["calibration"] = {name: value for name, (value, _) in state.by_name.items()}
-        summary["calibration"] |= {f"{name}_sigma": sigma for name, (_, sigma) in state.by_name.items()}
-        summary["heading_sigma"] = float(state.sigmas[2])
-        found = diagnose(state, result.settings, result.scale)
-        summary |= {"diagnosis": found} if found else {}
+    if result.vehicle is not None:
+        summary |= _calibration(result.vehicle, result)
     if log.truth is not None:
         summary |= _map_errors(result, log, log.truth) | _trajectory_errors(result, log.truth)
     return summary
+
+
+def _cycles(result: RunResult) -> dict[str, Any]:
+    """Times of the updates, batches, notices and health of a run."""
+    seconds = [record.seconds for record in result.cycles]
+    found: dict[str, Any] = {"seconds": None}
+    if seconds:
+        p99 = float(np.quantile(seconds, 0.99))
+        found["seconds"] = {"mean": float(np.mean(seconds)), "p99": p99, "max": max(seconds)}
+    if result.batches is not None:
+        found["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
+    told = [record for record in result.cycles if record.jump is not None or record.notice]
+    if told:
+        keys = ("cycle", "t", "jump", "notice")
+        found["events"] = [{key: getattr(record, key) for key in keys} for record in told]
+    if any(record.health for record in result.cycles):
+        number = counts([health_of(record) for record in result.cycles])
+        found["health"] = {**number, "stretches": [asdict(of) for of in stretches_of(result)]}
+    return found
+
+
+def _calibration(state: VehicleState, result: RunResult) -> dict[str, Any]:
+    """Calibrations with their sigmas, and a diagnosis where one is far from its prior."""
+    values = {name: value for name, (value, _) in state.by_name.items()}
+    values |= {f"{name}_sigma": sigma for name, (_, sigma) in state.by_name.items()}
+    found = diagnose(state, result.settings, result.scale)
+    calibration = {"calibration": values, "heading_sigma": float(state.sigmas[2])}
+    return calibration | ({"diagnosis": found} if found else {})
 
 
 def _crossing(crossing: Crossing) -> dict[str, Any]:
