@@ -48,7 +48,8 @@ def estimate(values: Array) -> Estimate:
 
     From `FEWEST` values on, q is the quantile of `|m* - m| sqrt(n) / s*` over resamples with replacement (the
     bootstrap-t, which covers skewed values better than Student's t); below, it is Student's. The plain
-    percentiles of m* would cover the mean of five normal values in 84 % of the cases only.
+    percentiles of m* would cover the mean of five normal values in 84 % of the cases only. Half an
+    interval by resamples is at most the range of the values: s* is tiny in resamples without an outlier.
     """
     n = len(values)
     if n < 2:
@@ -59,6 +60,7 @@ def estimate(values: Array) -> Estimate:
         drawn = values[np.random.default_rng(0).integers(0, n, (RESAMPLES, n))]
         off, spread = np.abs(drawn.mean(axis=1) - mean), drawn.std(axis=1, ddof=1) / n**0.5
         quantile = float(np.quantile(off[spread > 0.0] / spread[spread > 0.0], LEVEL))
+        quantile = min(quantile, float(np.ptp(values)) / sem)
     return Estimate(mean, quantile * sem, n)
 
 

@@ -75,6 +75,14 @@ def test_the_bootstrap_covers_skewed_values_better_than_student_s_interval() -> 
     assert t + 0.02 < bootstrap < 0.96
 
 
+def test_one_value_far_out_gives_an_interval_no_wider_than_the_values() -> None:
+    """Resamples without it have hardly any spread: the bootstrap alone would give 475 times the range."""
+    values = np.array([0.0, 0.001, 0.0, 0.002, 0.001, 0.0, 0.003, 8.0])
+    found = estimate(values)
+    student = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert student.high - found.mean < found.half <= 8.0
+
+
 def test_drives_of_a_track_are_one_sample_and_of_a_single_track_each_is_one() -> None:
     index = pd.MultiIndex.from_product([["a", "b"], [0, 1]], names=["track", "seed"])
     values = pd.Series([1.0, 3.0, 5.0, 9.0], index)
