@@ -381,13 +381,20 @@ def test_the_figures_of_the_readme_are_those_of_the_files(hooks: Any) -> None:
         pairs.append((row["fixed-lag"], row["landmark-fixed-lag"]))
     isam2 = row_of("speed", "mean update relative to iSAM2 with known data association")["measured"]
     known = row_of("known", "drawn, another drive's (24 drives)")
+    lines = [row_of("lines", f"1 m, {estimator}") for estimator in ("fixed-lag", "spline")]
+    assert all(row["missed [%]"] == "0.0 ± 0.0" for row in lines)
     for estimator, variant in product(("fixed-lag", "spline"), ("default", "pure projection")):
         row = row_of("ablation", f"{estimator}, {variant}")
         shown = (row["rmse [m]"], row["difference"], row["trajectory error (ATE) [m]"])
         pairs.append(tuple(filter(None, shown)))
     readme = text_of(ROOT / "README.md")
     quoted = re.findall(r"[\d.]+ ± [\d.]+", readme)
-    assert quoted == [isam2, known["pose error [m]"], *chain.from_iterable(pairs)]
+    assert quoted == [
+        isam2,
+        known["pose error [m]"],
+        *(row["rmse [m]"] for row in lines),
+        *chain.from_iterable(pairs),
+    ]
     assert known["found [%]"] == "100 ± 0"
     runs = [row_of("real_runs", f"a{number}, online") for number in range(9, 14)]
     for name in ("end off by [m]", "dead reckoning off by [m]"):
