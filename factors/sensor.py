@@ -76,13 +76,14 @@ def restored(residual: Array, measured: Array, twists: Array, sensor: Array) -> 
     """Return `M^-1` (m, 2, 2) and the derivatives of `M^-1 r` (m, 2, 5) by the sensor's calibration.
 
     residual r (m, 2) is the expected minus the corrected detection, vehicle frame; measured (m, 2) and twists
-    (m, 3) are as in `by_sensor`. The derivatives are `-M^-1 C`, plus `dM^-1 r` for the errors of the ranges.
-    For an empty calibration M is the identity, and the derivatives are (m, 2, 0).
+    (m, 3) are as in `by_sensor`. The derivatives are `-M^-1 C`, plus `dM^-1 r = -M^-1 dM M^-1 r` for those
+    of the ranges. For an empty calibration M is the identity, and the derivatives are (m, 2, 0).
     """
     if len(sensor) == 0:
         return np.tile(np.eye(2), (len(measured), 1, 1)), np.zeros((len(measured), 2, 0))
     rates = by_range(measured)
     inverse = np.linalg.inv(np.eye(2) - np.einsum("mkij,k->mij", rates, sensor[RANGE]))
     jacobian = -inverse @ by_sensor(measured, twists)
-    jacobian[:, :, RANGE] += np.einsum("mil,mklj,mjn,mn->mik", inverse, rates, inverse, residual)
+    lengthened = np.einsum("mij,mj->mi", inverse, residual)
+    jacobian[:, :, RANGE] += np.einsum("mil,mklj,mj->mik", inverse, rates, lengthened)
     return inverse, jacobian

@@ -166,10 +166,10 @@ def ends_apart(log: Log) -> list[Hint]:
 
 def few_detections(log: Log) -> list[Hint]:
     """Return a hint if the typical cycle has too few detections for scan matching to check the odometry."""
-    counts = np.array([len(cycle.labels) for cycle in log.cycles])
-    if len(counts) < LEAST_CYCLES or _median(counts) >= MIN_MATCHED:
+    typical = _median(np.array([len(cycle.labels) for cycle in log.cycles]))
+    if len(log.cycles) < LEAST_CYCLES or typical >= MIN_MATCHED:
         return []
-    return [hint_of("few detections", count=_median(counts), least=MIN_MATCHED)]
+    return [hint_of("few detections", count=typical, least=MIN_MATCHED)]
 
 
 def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
