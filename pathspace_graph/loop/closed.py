@@ -1,14 +1,11 @@
 """The closed map: localization, refinement, and repair where cones contradict it."""
 
-from collections.abc import Mapping
-
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Health
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.spline.boundary import boundaries_cross
-from pathspace_graph.spline.bspline import BSpline
 
 from .closing import fix_gauge
 from .drive import Drive, Phase, Step
@@ -61,10 +58,10 @@ class Closed(Phase):
         return Step(self, notice=self._repair(road, drive, reading))
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
-        """Apply a repaired map that explains the contradictions and whose boundaries do not newly cross."""
-        solved = None if isinstance(outcome, Unsolved) else outcome
+        """Apply a repaired map that explains the contradictions, if nothing speaks against it."""
+        solved = None if isinstance(outcome, Unsolved) or outcome.objection else outcome
         notice = self.map_repair.end(solved)
-        if solved is None or not notice or _crosses(road, drive, solved.splines) > self._boundaries_cross:
+        if solved is None or not notice:
             return Step(self)
         jump = drive.swap_in(road, solved)
         self._boundaries_cross = _crosses(road, drive)
@@ -97,10 +94,8 @@ class Closed(Phase):
             fix_gauge(smoother)
 
 
-def _crosses(road: Road, drive: Drive, splines: Mapping[int, BSpline] | None = None) -> bool:
-    """Whether both boundaries, by default those of the road, cross beside the driven path."""
-    if splines is None:
-        road.smoother.refresh()
-        splines = road.smoother.map.state.splines
-    driven = drive.record.poses[:, :2]
+def _crosses(road: Road, drive: Drive) -> bool:
+    """Whether both boundaries cross beside the driven path."""
+    road.smoother.refresh()
+    splines, driven = road.smoother.map.state.splines, drive.record.poses[:, :2]
     return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, SAMPLE, driven)

@@ -26,7 +26,7 @@ from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import GrowthSettings
-from pathspace_graph.spline.boundary import ahead_of, sampled
+from pathspace_graph.spline.boundary import Boundary, ahead_of, sampled
 from pathspace_graph.spline.bspline import BSpline
 
 from .closing import SIGMA_STEP
@@ -39,12 +39,14 @@ CONES: Final = 3  # least number of contradictions of a repaired stretch
 REPAIR_BESIDE: Final = 0.5  # distance from a curve within which a cone does not contradict it (m)
 CERTAIN: Final = 1.0  # largest sigma of a detection that may contradict the map (m)
 ROW: Final = 11.0  # largest distance of neighbours in a row (m): two regular gaps, as a cone may be missed
+ROW_ALONG: Final = 2.0 * ROW  # the same along the drive (m), which is longer on the inner side of a bend
 SETTLE: Final = 1.5  # time without detections after which a cone counts as passed (s)
 MOST: Final = 20  # number of passed contradictions from which a stretch is repaired before its end
 REPAIR_INTERVAL: Final = 1.0  # time between searches for contradictions (s)
 REPAIRS: Final = 8  # largest number of attempts
 REPLACED: Final = 0.5  # prior standard deviation of moved control points of a known map (m)
 BEND: Final = 0.1  # weight of the second differences of their moves
+LEFT_OUT: Final = 2.0  # distance from a repaired curve beyond which a cone of the earlier curve is lost (m)
 EXPLAINED: Final = 0.5  # least share of the contradictions that a repaired map must explain
 
 
@@ -131,6 +133,7 @@ class MapRepair(Copyable):
         self.contradictions = Contradictions(settings.growth)
         self._stretches: list[ContradictedStretch] = []
         self._lap: Array = np.zeros((0, 3))  # poses of the newest lap at the start of the attempt
+        self._mapped = dict[int, Array]()  # cones (k, 2) on each curve at the start of the attempt
         self._asked = -np.inf
         self._wait_until = 0.0
         self._attempts = 0
@@ -151,6 +154,7 @@ class MapRepair(Copyable):
         track, state = smoother.map, smoother.map.state
         longest = max(boundary.length for boundary in state.boundaries.values())
         self._lap = poses[lap_begin(poses, longest) :]
+        self._mapped = {label: mapped_cones(track, label)[1] for label in state.boundaries}
         splines = {label: refitted(track, label, self._stretches, poses) for label in state.boundaries}
         return ClosedMap(splines, poses, state.variables.calibrations.copy())
 
@@ -175,16 +179,24 @@ class MapRepair(Copyable):
         return f"{REPAIRED}: it passes through {count} other cones on the {' and on the '.join(names)}"
 
     def end(self, marginal: LapMarginal | None) -> str:
-        """End an attempt; return its notice, which is empty unless the batch explains the contradictions."""
+        """End an attempt; return its notice, which is empty if the batch does not repair the map.
+
+        It must explain the contradictions, and more cones than it takes from the curves.
+        """
         stretches, self._stretches = self._stretches, []
         if marginal is None:
             return ""
         now, explained = marginal.poses[len(marginal.poses) - len(self._lap) :], [0, 0]
+
+        def distances(label: int, cones: Array) -> Array:
+            curve = KDTree(sampled(marginal.splines[label], SAMPLE))
+            return np.asarray(curve.query(carried(cones, self._lap, now))[0])
+
         for stretch in stretches:
-            cones = carried(stretch.cones, self._lap, now)
-            distance = KDTree(sampled(marginal.splines[stretch.label], SAMPLE)).query(cones)[0]
-            explained[stretch.label] += int(np.count_nonzero(distance < REPAIR_BESIDE))
-        if sum(explained) < EXPLAINED * sum(len(stretch.cones) for stretch in stretches):
+            near = distances(stretch.label, stretch.cones) < REPAIR_BESIDE
+            explained[stretch.label] += int(np.count_nonzero(near))
+        lost = sum(int(np.sum(distances(label, old) > LEFT_OUT)) for label, old in self._mapped.items())
+        if sum(explained) < max(EXPLAINED * sum(len(stretch.cones) for stretch in stretches), lost):
             return ""
         self._wait_until = 0.0
         self.contradictions.clear()
@@ -239,9 +251,7 @@ def refitted(track: CurveMap, label: int, stretches: list[ContradictedStretch], 
     chosen = [stretch for stretch in stretches if stretch.label == label]
     if not chosen:
         return state.spline(label)
-    boundary = state.boundaries[label]
-    u = track.cones.get(label, np.arange(boundary.tables.low, boundary.tables.high, settings.spline.spacing))
-    cones = boundary.evaluate(state.control_points(label), u)
+    boundary, cones = mapped_cones(track, label)
     lap, stations = newest_lap(poses, boundary.length)
     at = along_and_across(cones, lap, stations)[0]
     for stretch in chosen:
@@ -251,6 +261,13 @@ def refitted(track: CurveMap, label: int, stretches: list[ContradictedStretch], 
     if len(cones) < settings.spline.min_size:
         return state.spline(label)
     return fit_through(cones[np.argsort(at)], True, settings, settings.batch.dense_share)
+
+
+def mapped_cones(track: CurveMap, label: int) -> tuple[Boundary, Array]:
+    """Return a boundary and the cones (k, 2) on its curve, or points at regular distances on a line."""
+    boundary, spacing = track.state.boundaries[label], track.settings.spline.spacing
+    u = track.cones.get(label, np.arange(boundary.tables.low, boundary.tables.high, spacing))
+    return boundary, boundary.evaluate(track.state.control_points(label), u)
 
 
 def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:
@@ -269,9 +286,14 @@ def lap_begin(poses: Array, length: float) -> int:
 
 
 def _is_replaced(cones: Array, at: Array, row: Array, row_at: Array, settings: MapperSettings) -> BoolArray:
-    """Whether cones (k, 2) at stations (k,) coincide with a row (r, 2), or lie beside it."""
+    """Whether cones (k, 2) at stations (k,) coincide with a row (r, 2), or lie beside it.
+
+    A row that leads across the neck of a hairpin does not replace the cones of the hairpin.
+    """
     order, beside = np.argsort(row_at), REPAIR_BESIDE
     away = np.abs(along_and_across(cones, row[order], row_at[order])[1])
-    within = (at > row_at.min() - beside) & (at < row_at.max() + beside)
+    ends = np.sort(np.concatenate([[-np.inf], row_at - beside, row_at + beside, [np.inf]]))
+    after = ends.searchsorted(at)
+    within = ends[after] - ends[after - 1] < ROW_ALONG
     same = KDTree(row).query(cones)[0] < settings.growth.merge_radius
     return np.asarray(same | (within & (away > beside)))

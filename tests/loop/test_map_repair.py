@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop import closed, map_repair
+from pathspace_graph.loop import map_repair
 from pathspace_graph.loop.closed import Closed
-from pathspace_graph.loop.drive import Drive
+from pathspace_graph.loop.drive import Drive, Step
 from pathspace_graph.loop.map_repair import REPAIRED, ContradictedStretch, carried, newest_lap, refitted
+from pathspace_graph.mapping.road import Road
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online
 from pathspace_graph.sim.faults import Faults, SensorFaults
@@ -115,15 +117,26 @@ def test_the_record_has_the_pose_of_every_cycle_in_the_frame_of_the_mended_map()
     assert np.hypot(*(poses - true_poses(clean()))[:, :2].T).max() < 0.3
 
 
-@pytest.mark.parametrize("why", ["it explains too few", "its boundaries cross"])
+@pytest.mark.parametrize(
+    "why", ["it explains too few", "it takes more than it explains", "its boundaries cross"]
+)
 def test_a_map_that_does_not_explain_the_contradictions_or_is_worse_is_refused(
     why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is asked to explain more of them than there are, or its boundaries are said to cross."""
+    """More are asked for than there are, far cones lay on the curve, or the batch has an objection."""
+    take = Closed.take
+
+    def take_worse(phase: Closed, road: Road, drive: Drive, outcome: LapMarginal) -> Step:
+        if why == "its boundaries cross":
+            return take(phase, road, drive, replace(outcome, objection=why))
+        mapped = phase.map_repair._mapped
+        mapped[RIGHT] = np.concatenate([mapped[RIGHT], np.full((40, 2), 1e3)])
+        return take(phase, road, drive, outcome)
+
     if why == "it explains too few":
         monkeypatch.setattr(map_repair, "EXPLAINED", 2.0)
     else:
-        monkeypatch.setattr(closed, "_crosses", lambda *road_drive_splines: len(road_drive_splines) > 2)
+        monkeypatch.setattr(Closed, "take", take_worse)
     mapper, results = map_log(holed(), *map_beginning(holed(), LAP))
     jumps = [result.t for result in results if result.jump is not None]
     assert len(jumps) == 1  # the swap of the open lap
@@ -148,6 +161,21 @@ def test_a_curve_is_led_through_new_cones_and_stays_elsewhere() -> None:
     away = np.hypot(*(before[:, None] - cones).transpose(2, 0, 1)).min(axis=1) > 8.0
     moved = np.hypot(*(before[away, None] - after).transpose(2, 0, 1)).min(axis=1)
     assert moved.max() < 0.3
+
+
+def test_a_row_across_a_neck_does_not_replace_the_cones_of_the_way_round() -> None:
+    """The first row is one of new cones on a stretch, the second has its ends alone."""
+    mapper, _ = repaired()
+    track, poses = mapper.road.smoother.map, np.array(mapper.drive.record.poses)
+    boundary, points = track.state.boundaries[LEFT], mapper.control_points(LEFT)
+    between = boundary.evaluate(points, np.arange(42.0, 63.0, 1.0))
+    for u, stays in ((np.arange(30.0, 76.0, 3.0), False), (np.array([30.0, 33.0, 72.0, 75.0]), True)):
+        tangent = boundary.evaluate(points, u, 1)
+        normal = np.column_stack([-tangent[:, 1], tangent[:, 0]]) / np.hypot(*tangent.T)[:, None]
+        cones = boundary.evaluate(points, u) + 1.5 * normal
+        after = sampled(refitted(track, LEFT, [ContradictedStretch(LEFT, cones)], poses), 0.25)
+        moved = np.hypot(*(between[:, None] - after).transpose(2, 0, 1)).min(axis=1)
+        assert bool(moved.max() < 0.3) is stays
 
 
 def test_a_curve_without_contradictions_stays_to_the_bit() -> None:
