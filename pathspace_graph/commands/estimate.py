@@ -57,11 +57,18 @@ def online_command(options: Online) -> Outcome:
         plotting().check_picture(options.plot)
     viewing = viewers(options)
     if viewing is not None:
-        viewing.check_watchers(options)
+        viewing.check_recording(options.save_view, options.view)
     log, hints = read_plausible_log(options.log, options.settings.limits)
     tell(hints)
     log, estimator = begin(options, log, parameters) if known is None else begin_on(options, known, log)
-    with nullcontext([]) if viewing is None else viewing.watchers(options, log) as observers:
+    with (
+        nullcontext()
+        if viewing is None
+        else viewing.recording(
+            options.save_view, window=options.view, settings=options.recording, truth=log.truth
+        ) as recorder
+    ):
+        observers = [] if recorder is None else [recorder]
         mapped = map_online(log, estimator, options.estimator, observers)
         result = of_kind(with_own(mapped, parameters), options.map, options.settings)
         differ = [] if known is None else known.differences(result, estimator)
@@ -78,7 +85,7 @@ def online_command(options: Online) -> Outcome:
     wrong = [f"not a map of the drive: {crossed}"] if crossed else []
     if known is not None and known.found_at(estimator) is None:
         wrong.append(f"the vehicle was not found on {options.on}: this is the map of its own road")
-    files = (options.out, options.save, options.plot, options.save_view, options.animate)
+    files = (options.out, options.save, options.plot, options.save_view)
     return Outcome([file for file in files if file is not None], summarized, wrong)
 
 
@@ -88,8 +95,8 @@ def plotting() -> Any:
 
 
 def viewers(options: Online) -> Any:
-    """Import the module of viewers and films if one is requested, which draws as well."""
-    asked = options.view or options.save_view is not None or options.animate is not None
+    """Import the module of the viewer if it is requested."""
+    asked = options.view or options.save_view is not None
     return import_module("pathspace_graph.eval.view.recording") if asked else None
 
 
