@@ -41,7 +41,6 @@ class MapStyle:
     path_width: float = 0.6  # width of the trajectory; the true path is thinner
     marker_size: float = 2.6
     landmark_size: float = 1.4  # size of landmarks, small enough for their ellipses to be seen
-    widest_band: float = np.inf  # greatest width of a band on either side of its curve (m)
 
 
 WHOLE_TRACK: Final = MapStyle()  # style of a panel that shows a whole track
@@ -64,7 +63,8 @@ def plot_map(
     It is drawn in another colour where the `health` of its n cycles is not good. Beside a `smoothed` one
     (n, 3) it is drawn thin, as the poses that were estimated at their time.
     The `differences` are places that are not where a known map has them, each marked by a cross.
-    The legend says so where a `band_scale` other than 1 draws the band wider than it is.
+    The band is cut at 3 m, as at the open end of a road. The legend says so where a `band_scale` other than
+    1 draws it wider than it is.
     """
     if not band_scale > 0.0:
         raise SettingsError(f"band_scale: expected a positive number, found {band_scale}")
@@ -107,7 +107,7 @@ def draw_boundary(
         return
     spline, text = boundary.spline, f"{name} {style.SIGMAS:g}σ band{exaggerated}"
     if boundary.covariance.size:  # the outline of a map has none
-        style.draw_band(axes, boundary, color, text, band_scale, look.widest_band, alpha=BAND_ALPHA)
+        style.draw_band(axes, boundary, color, text, band_scale, alpha=BAND_ALPHA)
     until = boundary.confirmed_until
     style.draw_curve(axes, spline, color, f"{name} boundary", look.curve_width, (-np.inf, until), zorder=4)
     if until < spline.domain[1]:

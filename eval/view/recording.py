@@ -241,7 +241,7 @@ class Recorder:
     def _band(self, boundary: MapBoundary) -> list[Array]:
         if isinstance(boundary, SplineBoundary):
             u = style.curve_parameters(boundary.spline, self._settings.samples_per_span)
-            return list(style.uncertainty_band(boundary, u, widest=5.0))
+            return list(style.uncertainty_band(boundary, u))
         return list(style.ellipse_outlines(boundary.points, boundary.covariance))
 
     def _show_vehicle(self, cycle: ObservedCycle) -> None:
