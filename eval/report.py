@@ -20,15 +20,18 @@ from . import real, views
 from .benchmark.measurement import figures, measure_drive
 from .benchmark.roads import QUICK, make_drives
 from .benchmark.scaling import measure_scaling, scaling_table
+from .experiment.drives import Drive, load_tracks
 from .experiment.faults import at_strength, fault_table, kinds, only, outcomes, suite
 from .experiment.frame import write_csv
 from .experiment.provenance import made
+from .experiment.rows import rows_of
 from .experiment.run import run_study
 from .experiment.study import Baseline, Study, find_study, read_study_file
 from .experiment.tables import Quantity, Table
 from .hints import HintStudy
 from .joint import JointStudy, joint_table
 from .known import KnownStudy, known_table
+from .metrics.reference import landmark_limit
 from .views import ESTIMATORS, LANDMARKS, ONLINE
 
 ABLATIONS: Final = ("stations", "gauge", "robust", "density", "lag", "relinearize", "degree", "covariance")
@@ -99,7 +102,12 @@ class Plan:
 
     def camera(self, folder: Path) -> Tables:
         """Drive the study `camera` with one seed, whose noise is another one on each track."""
-        return {"": views.camera_table(self._shipped("camera", folder, seeds=(0,))[1], CAMERA)}
+        study, frame = self._shipped("camera", folder, seeds=(0,))
+        (noise,), (seed,), tracks = study.noise, study.seeds, load_tracks(study.tracks)
+        drives = [Drive(track, seed, noise, study.simulation(noise)) for track in tracks]
+        parts = [{"track": d.track, "settings": d.simulation, "seed": d.own_seed} for d in drives]
+        limits = rows_of(landmark_limit, parts, folder / "landmarks", **self._how)
+        return {"": views.camera_table(frame, limits, CAMERA)}
 
     def hard(self, folder: Path) -> Tables:
         study, frame = self._shipped("hard", folder, seeds=(0,))

@@ -6,7 +6,7 @@ from typing import Final
 
 import pandas as pd
 
-from .experiment.frame import RUN, RUN_OF, TIMES, contrasts, last_laps
+from .experiment.frame import RUN_OF, TIMES, contrasts, last_laps
 from .experiment.statistics import by_track
 from .experiment.study import Study
 from .experiment.tables import Quantity, Table, names_of
@@ -73,11 +73,10 @@ def skidpad_table(frame: pd.DataFrame) -> Table:
     return runs_table(frame.assign(ate=square**0.5), ("estimator",), ("ate", "rmse", "missed"))
 
 
-def camera_table(frame: pd.DataFrame, keys: Sequence[str]) -> Table:
-    """Return the map of each estimator on drawn cars, and the rmse that the landmarks' limit allows."""
+def camera_table(frame: pd.DataFrame, limits: pd.DataFrame, keys: Sequence[str]) -> Table:
+    """Return the map of each estimator on drawn cars, and the rmse of landmarks that are told all."""
     table = runs_table(frame, ("estimator",), keys)
-    limit = _figure("l", last_laps(frame).drop_duplicates([*RUN]))  # one of each drive
-    row = ("landmarks, given all", limit, *[Quantity(None)] * (len(keys) - 1))
+    row = ("landmarks, given all", _figure("rmse", limits), *[Quantity(None)] * (len(keys) - 1))
     return replace(table, rows=(*table.rows, row))
 
 

@@ -41,7 +41,7 @@ class Plan:
     def resolved(self) -> dict[str, Any]:
         """Return the content of `study.json`: the study with every default written out."""
         study = self.study
-        same = ("name", "question", "seeds", "laps", "estimators", "varied", "metrics", "columns")
+        same = ("name", "question", "seeds", "laps", "estimators", "varied", "metrics")
         return {
             "format": FORMAT,
             **{name: getattr(study, name) for name in same},
@@ -55,7 +55,6 @@ class Plan:
                 if variant.parameters
             },
             "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
-            "reference_limits": study.reference_limits,
         }
 
 
@@ -81,7 +80,6 @@ def make_plan(study: Study, *, keep: bool = False, ghosts: GhostSettings | None 
         EstimatorCell(
             *(drive, estimator, variant.settings, name, ghosts or GhostSettings()),
             parameters=dict(variant.parameters).get(estimator),
-            reference_limits=study.reference_limits,
             keep=keep,
             code=code[estimator],
             began=began,

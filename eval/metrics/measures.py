@@ -26,7 +26,6 @@ from .consistency import (
     turn_from_truth,
     with_marginals,
 )
-from .reference import limit
 from .registration import end_by_registration
 from .summary import has_cones, lap_times
 
@@ -80,16 +79,12 @@ def measure(
     log: Log,
     took: tuple[float, float] | None = None,
     ghost_settings: GhostSettings | None = None,
-    *,
-    reference_limits: bool = False,
 ) -> list[Row]:
     """Return a row for each complete lap, and one for the whole run as the last; lengths are over the scale.
 
     A lap's row has the map as it stood at its end, and the poses and updates of its cycles. Laps are the true
     ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and so one
     row, that of the last lap. `took` is the wall time and the processor time of the whole run (s).
-    `reference_limits` asks for `l` and `limit`, by a batch with oracle association (ValueError without
-    associations).
     """
     run, log = run.at_scale_one(), scaled(log, 1.0 / run.scale)
     rows = []
@@ -111,8 +106,6 @@ def measure(
         }
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
-    if reference_limits:
-        values |= limit(log, run.map)
     if took is not None:
         values["seconds"], values["seconds_processor"] = took
     return [*rows, Row(None, values)]

@@ -1,4 +1,4 @@
-"""The landmark batch that is told the truth, on answers known by hand, and the limit made of it."""
+"""The landmark batch that is told the truth, on answers known by hand."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.baselines.landmark_batch import solve_landmarks
 from pathspace_graph.eval.metrics.accuracy import root_mean_square
 from pathspace_graph.eval.metrics.reference import (
-    fit_rmse,
     landmark_rmse,
-    limit,
     solve_oracle_landmarks,
     with_true_covariances,
     with_true_noise,
@@ -22,7 +20,6 @@ from pathspace_graph.eval.metrics.reference import (
 from pathspace_graph.eval.metrics.trajectory import position_rms, trajectory_errors
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
-from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
@@ -30,7 +27,6 @@ from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.sensor import SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.vehicle import VehicleSettings
-from pathspace_graph.spline.bspline import BSpline
 
 from ...scenes.drives import bean_track
 
@@ -166,33 +162,6 @@ def test_a_log_in_which_nothing_is_seen_gives_the_odometry() -> None:
     np.testing.assert_allclose(solved.variables.poses[:, :2], expected, atol=1e-6)
 
 
-def exact_ring_map(size: int) -> Map:
-    """What was mapped matters to the limit by size, degree and closedness only."""
-    nowhere = BSpline.periodic_from(np.arange(size + 1.0), np.zeros((size, 2)))
-    return Map(True, {LEFT: SplineBoundary(nowhere, np.zeros((2 * size, 2 * size)))})
-
-
-def test_the_fit_to_a_ring_gets_better_with_size_and_is_exact_with_a_control_point_for_each() -> None:
-    log = circle_log(noise=0.0)
-    assert log.truth is not None
-    errors = [fit_rmse(exact_ring_map(size), log.truth) for size in (4, 6, 8)]
-    assert 1.0 > errors[0] > errors[1] > errors[2] > 0.0
-    assert errors[2] < 0.05
-    assert fit_rmse(exact_ring_map(16), log.truth) == 0.0
-    landmarks = Map(True, {LEFT: PointBoundary(np.zeros((3, 2)), np.eye(6))})
-    assert fit_rmse(landmarks, log.truth) == 0.0
-    assert np.isnan(fit_rmse(Map(False, {}), log.truth))
-
-
-def test_the_limit_is_both_together() -> None:
-    log = circle_log(noise=1.0)
-    assert log.truth is not None
-    found = limit(log, exact_ring_map(6))
-    assert found["l"] == landmark_rmse(solve_oracle_landmarks(log)[1], log.truth) > 0.0
-    fit = fit_rmse(exact_ring_map(6), log.truth)
-    assert found["limit"] ** 2 == pytest.approx(found["l"] ** 2 + fit**2)
-
-
 def test_unknown_cones_are_not_counted() -> None:
     log = circle_log(noise=1.0)
     assert log.truth is not None
@@ -204,10 +173,10 @@ def test_unknown_cones_are_not_counted() -> None:
     assert landmark_rmse(solved, told) == pytest.approx(root_mean_square(errors))
 
 
-def test_a_log_without_truth_has_no_limit() -> None:
+def test_a_log_without_truth_or_associations_is_refused() -> None:
     log = circle_log(noise=0.0, laps=0.2)
     with pytest.raises(ValueError, match="truth"):
-        limit(Log(log.odometry, log.cycles, log.odometry_sigma), exact_ring_map(6))
+        solve_oracle_landmarks(Log(log.odometry, log.cycles, log.odometry_sigma))
     assert log.truth is not None
     told = Truth(log.truth.pose_t, log.truth.poses, log.truth.cones, log.truth.cone_labels)
     with pytest.raises(ValueError, match="associations"):
