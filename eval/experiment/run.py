@@ -16,7 +16,6 @@ from pathspace_graph.eval.metrics.alignment import aligned_distance
 from pathspace_graph.io.files import check_target, remove_manifest, write_json
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.parsing import read_json, shown
-from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.sim.track import Track
 
 from .cells import EstimatorCell
@@ -58,7 +57,7 @@ class Plan:
         }
 
 
-def make_plan(study: Study, *, keep: bool = False, ghosts: GhostSettings | None = None) -> Plan:
+def make_plan(study: Study, *, keep: bool = False) -> Plan:
     """Read and generate the tracks, and return the cells, grouped by the log that they share.
 
     With `keep`, the map, trajectory, cycles and summary of each are kept.
@@ -78,7 +77,7 @@ def make_plan(study: Study, *, keep: bool = False, ghosts: GhostSettings | None 
         drives += [RecordedDrive(track, number, folder, limits) for number, folder in enumerate(folders)]
     cells = tuple(
         EstimatorCell(
-            *(drive, estimator, variant.settings, name, ghosts or GhostSettings()),
+            *(drive, estimator, variant.settings, name),
             parameters=dict(variant.parameters).get(estimator),
             keep=keep,
             code=code[estimator],

@@ -24,8 +24,8 @@ from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.spline.bspline import BSpline
 
 WIDTH: Final = 7.0  # width of a figure (in): two columns of a paper
-CURVE_WIDTH: Final = 1.3  # width of a curve (pt)
-MARKER_SIZE: Final = 4.0  # size of a control point or a detection (pt)
+CURVE_WIDTH: Final = 0.7  # width of a curve (pt)
+MARKER_SIZE: Final = 2.6  # size of a control point or a detection (pt)
 ALPHA: Final = 0.25
 
 BLUE: Final = "#0067A9"
