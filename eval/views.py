@@ -96,15 +96,6 @@ def study_table(study: Study, frame: pd.DataFrame) -> Table:
     return Table((", ".join(several), heading, "difference", "p", *headings), tuple(rows))
 
 
-def hints_table(rows: pd.DataFrame) -> Table:
-    """Return the number of logs whose cause is named, for each mistake, or that are accused."""
-    spoiled, good = rows[rows["kind"] == "spoiled"], rows[rows["kind"] == "good"]
-    groups = {str(name): of["named"] for name, of in spoiled.groupby("name", sort=False)}
-    groups |= {"all mistakes": spoiled["named"], "good logs, accused of any": good["accused"]}
-    figures = tuple((name, *Quantity.row((hits.sum(), len(hits)), 0)) for name, hits in groups.items())
-    return Table(("mistake", "named", "logs"), figures)
-
-
 def _parts(frame: pd.DataFrame, *names: str) -> dict[str, pd.DataFrame]:
     """Return the last lap of each run, by the values of some columns."""
     groups = last_laps(frame).groupby([*names], sort=False)
