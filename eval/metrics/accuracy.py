@@ -192,13 +192,6 @@ def curve_distance(track: Map, truth: Truth) -> dict[str, float]:
     return {"mapped_to_truth": to_truth, "truth_to_mapped": to_mapped}
 
 
-def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
-    """Return the mean of both distances (m) between two mapped boundaries."""
-    forth = boundary_distances(second, mapped_points(first))
-    back = boundary_distances(first, mapped_points(second))
-    return 0.5 * (mean_of(forth) + mean_of(back))
-
-
 def crossings(track: Map) -> tuple[int, int]:
     """Return how often the curves of a map cross each other, and how often they cross themselves."""
     chords, owner = [np.zeros((0, 2, 2))], [np.zeros(0)]

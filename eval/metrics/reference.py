@@ -1,6 +1,6 @@
 """What a run is compared with: the landmark batch that is told all about its log, and another run."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,16 +10,13 @@ from pathspace_graph.baselines.landmark_map import LandmarkState
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.covariances import ray_covariances
 from pathspace_graph.io.log import Detections, Log, Truth
-from pathspace_graph.io.results import RunResult
-from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import CalibrationSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
 
-from . import accuracy
 from .accuracy import root_mean_square
-from .trajectory import pose_errors
 
 
 def landmark_limit(track: Track, settings: SimulationSettings, seed: int) -> list[dict[str, Any]]:
@@ -137,21 +134,3 @@ def truth_of(log: Log) -> Truth:
     if log.truth is None:
         raise ValueError("expected a log with truth, found one without")
     return log.truth
-
-
-@dataclass(frozen=True)
-class Gap:
-    """Distance of one run from another."""
-
-    curves: dict[str, float]  # two-way distance (m) of each boundary that both have mapped
-    along: float  # rms error along (m), in the frames of the reference
-    across: float  # (m)
-    heading: float  # (rad)
-
-
-def gap(run: RunResult, reference: RunResult) -> Gap:
-    shared = sorted(set(run.map.boundaries) & set(reference.map.boundaries))
-    own, others = run.map.boundaries, reference.map.boundaries
-    curves = {NAMES[label]: accuracy.two_way_distance(own[label], others[label]) for label in shared}
-    errors = pose_errors(run.trajectory_t, run.trajectory, reference.trajectory_t, reference.trajectory)
-    return Gap(curves, *(root_mean_square(column) for column in errors.T))

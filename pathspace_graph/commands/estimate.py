@@ -21,7 +21,6 @@ from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
-from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.health import DEGRADED, LOST, counts
@@ -273,14 +272,13 @@ def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
 
 
 def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
-    """Summary of a run, how its optimization began and ended, and its gap from an online start."""
+    """Summary of a run, and how its optimization began and ended."""
     start = "odometry" if isinstance(result, BatchResult) and result.online is None else "online"
     summary = summarize(result, log, hints) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
         return summary
-    of_start = None if result.online is None else asdict(gap(result.online, result))
     summary |= {"convergence": asdict(result.convergence), "objection": result.objection}
-    return summary | {"stages": result.seconds, "gap": of_start}
+    return summary | {"stages": result.seconds}
 
 
 def tell(hints: Sequence[Hint], of: str = "") -> None:

@@ -25,7 +25,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.sensor import SensorSettings
-from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.vehicle import VehicleSettings
 
 from ...scenes.drives import bean_track
@@ -152,16 +152,6 @@ def test_false_positives_are_left_out_and_colours_not_looked_at() -> None:
     assert solved.variables.poses.shape == (3, 3)
 
 
-def test_a_log_in_which_nothing_is_seen_gives_the_odometry() -> None:
-    log = circle_log(noise=0.0)
-    detections = sum(len(cycle.labels) for cycle in log.cycles)
-    system, solved = solve_landmarks(log, np.full(detections, -1))
-    assert solved.landmarks.shape == (0, 2)
-    assert system.eliminated(solved).joint(solved.keys).shape == (0, 0)
-    expected = circle_poses(system.chain.stamps)[:, :2]
-    np.testing.assert_allclose(solved.variables.poses[:, :2], expected, atol=1e-6)
-
-
 def test_unknown_cones_are_not_counted() -> None:
     log = circle_log(noise=1.0)
     assert log.truth is not None
@@ -242,18 +232,6 @@ def test_a_covariance_shrinks_by_the_slope_of_ranges_that_bend() -> None:
     np.testing.assert_allclose(told.cycles[0].covariances[0], expected, atol=1e-12)
 
 
-def test_told_all_of_drawn_cars_the_batch_is_better_than_told_less() -> None:
-    found = []
-    for seed in range(4):
-        log = simulate(bean_track(), SimulationSettings(laps=1, draw=True), seed)
-        assert log.truth is not None
-        told = [log, *(replace(log, truth=replace(log.truth, **{one: None})) for one in ("bend", "sensor"))]
-        found.append([landmark_rmse(solve_oracle_landmarks(one)[1], log.truth) for one in told])
-    everything, without_bend, without_sensor = np.mean(found, axis=0)
-    assert everything < 0.9 * without_bend
-    assert everything < 0.9 * without_sensor
-
-
 def test_told_the_noise_a_drawn_log_has_the_covariances_of_the_sensor() -> None:
     settings = SimulationSettings(laps=1, draw=True)
     log = with_true_covariances(simulate(bean_track(), settings, 1))
@@ -279,15 +257,3 @@ def test_two_sightings_of_a_cone_are_worth_less_by_their_correlation() -> None:
     expected = np.diag([0.09 * (1.0 + 0.2 * np.exp(-0.5)), 0.04 * (1.0 + 0.8 * np.exp(-0.5))])
     for cycle in told.cycles:
         np.testing.assert_allclose(cycle.covariances[0], expected)
-
-
-def test_told_the_noise_the_batch_is_better_than_told_that_it_is_white() -> None:
-    settings = replace(preset({"sensor": "camera", "odometry": "ins"}), laps=2)
-    told, white = [], []
-    for seed in range(4):
-        log = simulate(bean_track(), settings, seed)
-        assert log.truth is not None
-        told.append(landmark_rmse(solve_oracle_landmarks(log)[1], log.truth))
-        plain = replace(log, truth=replace(log.truth, noise=None))
-        white.append(landmark_rmse(solve_oracle_landmarks(plain)[1], log.truth))
-    assert np.mean(told) < np.mean(white)
