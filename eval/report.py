@@ -168,7 +168,7 @@ class Plan:
     def real_logs(self, folder: Path) -> Tables:
         if not self.real:
             raise SettingsError("--only real: expected logs in --real, found none")
-        drives = [real.map_real_log(log, folder) for log in self.real]
+        drives = real.map_real_logs(self.real, folder, **self._how)
         return {
             "runs": real.runs_table(drives),
             "maps": real.maps_table(drives),
