@@ -101,7 +101,7 @@ def runs_table(drives: Sequence[RealDrive]) -> Table:
             crossed = (np.nan, np.nan) if name == "landmarks" else crossings(drive.maps[name])
             values = [100.0 * row["closed_at_end"], *drive.off(drive.ends[name]), *reckoned, *crossed]
             values += [100.0 * row.get(f"reported_{word}", np.nan) for word in ("degraded", "lost")]
-            values.append(row.get("ms_mean", np.nan))
+            values.append(row.get("ms_processor", np.nan))
             rows.append((f"{drive.name}, {name}", *Quantity.row(values, 0, 2, 1, 2, 1, 0, 0, 1, 1, 1)))
     return Table(header, tuple(rows))
 

@@ -4,10 +4,10 @@ import json
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import pandas as pd
 
@@ -44,15 +44,13 @@ _MEASURED: Final = (
     *("rmse", "size", "missed", "closed_at_end", "lost_at_end"),
     *("reported_degraded", "reported_lost", *_WORST),
 )
-_NAME: Final = re.compile(r"(?P<kind>.+): (?P<strength>(?P<value>[-+.\d]+)(?: (?P<unit>\S+))?)")
+_NAME: Final = re.compile(r"(?P<kind>.+): (?P<value>[-+]?\d+(\.\d+)?)( (?P<unit>\S+))?")
 
 
-@dataclass(frozen=True)
-class Fault:
-    """A fault of a kind and a strength."""
+class Fault(NamedTuple):
+    """A fault of a kind, and its strength."""
 
     kind: str
-    strength: str  # as it is written, a number and a unit
     value: float
     unit: str
 
@@ -60,14 +58,11 @@ class Fault:
 def fault_of(noise: str) -> Fault:
     """Return the fault of a noise such as `latency: 20 ms`; SettingsError for any other name."""
     if noise == CLEAN:
-        return Fault(CLEAN, "", 0.0, "")
+        return Fault(CLEAN, 0.0, "")
     match = _NAME.fullmatch(noise)
-    try:
-        value = float(match["value"] if match else "")
-    except ValueError as error:
-        raise SettingsError(f"noise: expected a name such as 'latency: 20 ms', found '{noise}'") from error
-    assert match is not None
-    return Fault(match["kind"], match["strength"], value, match["unit"] or "")
+    if match is None:
+        raise SettingsError(f"noise: expected a name such as 'latency: 20 ms', found '{noise}'")
+    return Fault(match["kind"], float(match["value"]), match["unit"] or "")
 
 
 def suite() -> Study:
