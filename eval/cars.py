@@ -1,13 +1,18 @@
-"""Simulated cars on generated tracks, as the studies of known and joint maps drive them."""
+"""Simulated cars on generated tracks, as the studies of known and joint maps drive them, and their table."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 
 from pathspace_graph.sim.simulate import SimulationSettings
 from pathspace_graph.sim.track import Track
 from pathspace_graph.sim.track_generator import generate_track
+
+from .experiment.tables import Quantity, Table
+
+Columns = Mapping[str, tuple[str, int, float]]  # of a table, by their key: heading, digits, factor
 
 CARS: Final[Mapping[str, SimulationSettings]] = {
     "plain": SimulationSettings(laps=2),
@@ -21,12 +26,20 @@ def generated(number: int) -> Track:
     return generate_track(np.random.default_rng(number))
 
 
-def on_tracks(
-    tracks: Sequence[int], cars: Mapping[str, SimulationSettings], **same: Any
-) -> list[dict[str, Any]]:
+def on_tracks(tracks: Sequence[int], **same: Any) -> list[dict[str, Any]]:
     """Return the arguments of a function of each car on each track, with the same others."""
     return [
         {"car": car, "track": track, "settings": settings, **same}
         for track in tracks
-        for car, settings in cars.items()
+        for car, settings in CARS.items()
     ]
+
+
+def over_tracks(title: str, parts: Mapping[str, pd.DataFrame], columns: Columns) -> Table:
+    """Return a row for each part, over tracks: the drives of one are no sample."""
+    rows = []
+    for label, part in parts.items():
+        means = part.groupby("track")[[*columns]].mean()
+        figures = (Quantity.of(means[key], digits, factor) for key, (_, digits, factor) in columns.items())
+        rows.append((label, *figures))
+    return Table((title, *(heading for heading, _, _ in columns.values())), tuple(rows))

@@ -3,20 +3,14 @@
 Good logs of all kinds are judged: what is unusual about them is no mistake.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from threadpoolctl import threadpool_limits
 
-from pathspace_graph.errors import check_name
-from pathspace_graph.eval.experiment.drives import load_tracks
-from pathspace_graph.eval.experiment.rows import rows_of
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.overrides import Overrides, override
 from pathspace_graph.labels import LEFT
@@ -25,6 +19,9 @@ from pathspace_graph.sim.mistakes import MISTAKES
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
+
+from .cars import generated
+from .experiment.tables import Quantity, Table
 
 Row = dict[str, Any]
 
@@ -161,43 +158,20 @@ GOOD: Final = {
 # --- the measurement -------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, kw_only=True)
-class HintStudy:
-    """Spoil simulated logs by each mistake, and vary good ones; say how many are named and accused."""
-
-    tracks: tuple[Path | int, ...] = (0, 1)
-    """Track files, folders of them, or seeds of generated tracks."""
-    seeds: tuple[int, ...] = (0, 1)
-    """Seeds of the drives on each track."""
-    laps: int = 1
-    """Laps of each drive."""
-    mistakes: tuple[str, ...] = tuple(MISTAKES)
-    """Mistakes by which logs are spoiled."""
-    kinds: tuple[str, ...] = (AS_SIMULATED,)
-    """Kinds of good logs that are spoiled."""
-
-    def measure(self, **how: Any) -> pd.DataFrame:
-        """Judge every log, and return a row for each; `how` is that of `rows_of`."""
-        for name in self.mistakes:
-            check_name(name, MISTAKES, "mistakes: expected a known one")
-        for name in self.kinds:
-            check_name(name, GOOD, "kinds: expected a known kind of good log")
-        parts = [
-            {"track": track, "seed": seed, "kind": kind, "laps": self.laps}
-            | {"mistakes": self.mistakes if kind in self.kinds else ()}
-            for track, seed, kind in product(load_tracks(self.tracks), self.seeds, GOOD)
-        ]
-        return rows_of(judge, parts, **how)
+def parts_of(tracks: Sequence[int], mistakes: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the arguments of `judge`: good logs of all kinds, of which the plain ones are spoiled too."""
+    return [
+        {"track": track, "kind": kind, "mistakes": mistakes if kind == AS_SIMULATED else ()}
+        for track, kind in product(tracks, GOOD)
+    ]
 
 
-def judge(track: Track, seed: int, kind: str, laps: int, mistakes: Sequence[str]) -> list[Row]:
+def judge(track: int, kind: str, mistakes: Sequence[str]) -> list[Row]:
     """Return a row for the good log of a kind, and for each of those that are spoiled by mistakes."""
-    log = GOOD[kind].log(track, seed, laps)
-    rows: list[Row] = [{"of": kind, "kind": "good", "name": kind, **judged(log)}]
-    for name in mistakes:
-        spoiled = MISTAKES[name](log)
-        rows.append({"of": kind, "kind": "spoiled", "name": name, **judged(spoiled, causes_of(name))})
-    return [{"track": track.name, "seed": seed} | row for row in rows]
+    log = GOOD[kind].log(generated(track), seed=0, laps=1)
+    spoiled = [{"name": name, **judged(MISTAKES[name](log), causes_of(name))} for name in mistakes]
+    rows = [{"kind": "good", "name": kind, **judged(log)}, *({"kind": "spoiled", **row} for row in spoiled)]
+    return [{"track": track, **row} for row in rows]
 
 
 def causes_of(mistake: str) -> tuple[str, ...]:
@@ -207,14 +181,15 @@ def causes_of(mistake: str) -> tuple[str, ...]:
 
 def judged(log: Log, causes: Sequence[str] = ()) -> Row:
     """Return what is said of a log, and whether one of the causes is named."""
-    begin = time.perf_counter()
-    with threadpool_limits(limits=1):
-        said = hints(log)
-    seconds, found = time.perf_counter() - begin, [hint.cause for hint in said]
-    return {
-        "accused": bool(said),
-        "named": any(cause in found for cause in causes),
-        "causes": "; ".join(found),
-        "seconds": seconds,
-        "text": " | ".join(hint.line for hint in said),
-    }
+    found = [hint.cause for hint in hints(log)]
+    is_named = any(cause in found for cause in causes)
+    return {"accused": bool(found), "named": is_named, "causes": "; ".join(found)}
+
+
+def hints_table(rows: pd.DataFrame) -> Table:
+    """Return the number of logs whose cause is named, for each mistake, or that are accused."""
+    spoiled, good = rows[rows["kind"] == "spoiled"], rows[rows["kind"] == "good"]
+    groups = {str(name): of["named"] for name, of in spoiled.groupby("name", sort=False)}
+    groups |= {"all mistakes": spoiled["named"], "good logs, accused of any": good["accused"]}
+    figures = tuple((name, *Quantity.row((hits.sum(), len(hits)), 0)) for name, hits in groups.items())
+    return Table(("mistake", "named", "logs"), figures)

@@ -1,7 +1,6 @@
 """What several drives of a track are worth as one batch: the error of the map by their number."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -16,15 +15,14 @@ from pathspace_graph.io.moved import moved_run
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from .cars import CARS, generated, on_tracks
-from .experiment.rows import rows_of
-from .experiment.tables import Quantity, Table
+from .cars import Columns, generated, over_tracks
+from .experiment.tables import Table
 from .metrics.alignment import shape_rmse
 from .metrics.consistency import consistency_at_cones, map_nees
 from .metrics.reference import truth_of
 from .metrics.trajectory import position_rms, trajectory_errors
 
-COLUMNS: Final = {  # of the table: title, digits, factor
+COLUMNS: Final[Columns] = {
     "shape": ("rmse of the shape [m]", 3, 1.0),
     "ratio": ("by half as many", 2, 1.0),
     "nees": ("NEES", 2, 1.0),
@@ -33,21 +31,8 @@ COLUMNS: Final = {  # of the table: title, digits, factor
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class JointStudy:
-    """Drives of generated tracks, mapped alone, and in groups of 2, 4 and so on."""
-
-    tracks: tuple[int, ...] = (50, 51, 52)  # seeds
-    drives: int = 8  # number of drives of each track, a power of two
-    cars: Mapping[str, SimulationSettings] = field(default_factory=lambda: CARS)
-
-    def measure(self, **how: Any) -> pd.DataFrame:
-        """Return a row for each map: car, track, drives in it, `COLUMNS`; `how` is that of `rows_of`."""
-        return rows_of(of_track, on_tracks(self.tracks, self.cars, drives=self.drives), **how)
-
-
 def of_track(car: str, track: int, settings: SimulationSettings, drives: int) -> list[dict[str, Any]]:
-    """Return the rows of one track, each drive of which is solved alone once."""
+    """Return a row for each map of 1, 2, 4 and so on drives of a track, each solved alone once."""
     logs = {str(seed): simulate(generated(track), settings, seed) for seed in range(drives)}
     alone = {name: solve_alone(log) for name, log in logs.items()}
     names, rows, count = [*logs], list[dict[str, Any]](), 1
@@ -86,14 +71,10 @@ def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) 
 
 
 def joint_table(frame: pd.DataFrame) -> Table:
-    """Return a row for each kind of car and number of drives, over tracks: the maps of one are no sample."""
-    rows = []
-    for car, of_car in frame.groupby("car", sort=False):
-        means = of_car.groupby(["drives", "track"])[["shape", "nees", "inside", "ate"]].mean()
-        for count in sorted(of_car["drives"].unique()):
-            own = means.loc[count]
-            before = means.loc[count // 2]["shape"] if count > 1 else np.nan
-            values = own.assign(ratio=own["shape"] / before)
-            figures = (Quantity.of(values[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
-            rows.append((f"{car}, {count} drive{'s' if count > 1 else ''}", *figures))
-    return Table(("cars, drives of a track", *(title for title, _, _ in COLUMNS.values())), tuple(rows))
+    """Return a row for each kind of car and number of drives, with the shape by that of half as many."""
+    shape = frame.groupby(["car", "track", "drives"])["shape"].mean()
+    parts = {}
+    for (car, count), part in frame.groupby(["car", "drives"], sort=False):
+        half = [shape.get((car, track, count // 2), np.nan) for track in part["track"]]
+        parts[f"{car}, {count} drive{'s' if count > 1 else ''}"] = part.assign(ratio=part["shape"] / half)
+    return over_tracks("cars, drives of a track", parts, COLUMNS)

@@ -1,7 +1,7 @@
 """How a vehicle finds itself on a known map: anywhere on it, on that of another track, on a changed one."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -19,22 +19,20 @@ from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from .cars import CARS, generated, on_tracks
-from .experiment.rows import rows_of
-from .experiment.tables import Quantity, Table
+from .cars import Columns, generated, over_tracks
+from .experiment.tables import Table
 from .metrics.accuracy import lap_metrics
 from .metrics.reference import truth_of
 from .metrics.registration import motion_onto
 from .metrics.trajectory import interpolate_poses
 
 OWN, SURVEYED, MOVED, OTHER = "another drive's", "surveyed", "surveyed, 7 cones moved", "another track's"
-KINDS: Final = (OWN, SURVEYED, MOVED, OTHER)  # of known maps
 SIGMA_SURVEY: Final = 0.15  # of the cones of a surveyed map (m)
 MOVED_CONES, MOVED_BY = 7, 2.5  # number of neighbours on the left that were moved, and how far (m)
 SOON: Final = 8.0  # time after which the vehicle should be found (s)
 DRIVEN: Final = 40.0  # time that is driven on a known map (s)
 WRONG: Final = 2.0  # distance (m) from the true pose at which the place where it was found is a wrong one
-COLUMNS: Final = {  # of the table: title, digits, factor
+COLUMNS: Final[Columns] = {
     "found": ("found [%]", 0, 100.0),
     "soon": (f"within {SOON:.0f} s [%]", 0, 100.0),
     "wrong": ("at a wrong place [%]", 0, 100.0),
@@ -43,23 +41,13 @@ COLUMNS: Final = {  # of the table: title, digits, factor
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class KnownStudy:
-    """Drives of generated tracks that begin anywhere on a map that was known before."""
-
-    tracks: tuple[int, ...] = (60, 61, 62, 63, 64, 65, 66, 67)  # seeds
-    begins: tuple[float, ...] = (0.0, 0.3, 0.6)  # where drives begin, as shares of the first lap's time
-    cars: Mapping[str, SimulationSettings] = field(default_factory=lambda: CARS)
-
-    def measure(self, **how: Any) -> pd.DataFrame:
-        """Return a row for each drive: car, track, kind, begin, `COLUMNS`; `how` is that of `rows_of`."""
-        return rows_of(of_track, on_tracks(self.tracks, self.cars, begins=self.begins), **how)
-
-
 def of_track(
     car: str, track: int, settings: SimulationSettings, begins: Sequence[float]
 ) -> list[dict[str, Any]]:
-    """Return the rows of the second drive of a track, on maps of the first one and of another track."""
+    """Return the rows of the second drive of a track, on maps of the first one and of another track.
+
+    It begins at some shares of the first lap's time.
+    """
     first, second = (simulate(generated(track), settings, seed) for seed in (0, 1))
     elsewhere = simulate(generated(track + 1000), settings, 0)
     truth, rows = truth_of(first), list[dict[str, Any]]()
@@ -127,12 +115,7 @@ def drive_on(known: Map, log: Log, share: float, motion: Array) -> dict[str, Any
 
 
 def known_table(frame: pd.DataFrame) -> Table:
-    """Return a row for each car and kind of map, over tracks: the drives of one are no sample."""
-    rows = []
-    for car, of_car in frame.groupby("car", sort=False):
-        for kind in KINDS:
-            drives = of_car[of_car["kind"] == kind]
-            means = drives.groupby("track")[[*COLUMNS]].mean()
-            figures = (Quantity.of(means[key], digits, f) for key, (_, digits, f) in COLUMNS.items())
-            rows.append((f"{car}, {kind} ({len(drives)} drives)", *figures))
-    return Table(("cars, known map", *(title for title, _, _ in COLUMNS.values())), tuple(rows))
+    """Return a row for each car and kind of map."""
+    groups = frame.groupby(["car", "kind"], sort=False)
+    parts = {f"{car}, {kind} ({len(part)} drives)": part for (car, kind), part in groups}
+    return over_tracks("cars, known map", parts, COLUMNS)

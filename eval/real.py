@@ -1,31 +1,33 @@
 """Logs of a real car without truth, mapped in three ways and compared with each other (docs/real.md)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.batch.joint_mapper import join
-from pathspace_graph.batch.mapper import BatchResult
+from pathspace_graph.errors import SolveError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, wrap_angle
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.front_end.front_end import seen_cycles
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.results import RunResult, write_result
-from pathspace_graph.plausibility.judge import read_plausible_log
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.io.map import Map, read_map
+from pathspace_graph.io.results import TRAJECTORY_FILE, read_trajectory
 
-from .experiment.cells import run_estimator
+from .experiment.cells import EstimatorCell
+from .experiment.run import make_plan, run_records
+from .experiment.runner import Record, run_folder
+from .experiment.study import Study
 from .experiment.tables import Quantity, Table
+from .joint import solve_alone
 from .metrics.accuracy import crossings
 from .metrics.alignment import aligned_distance, maps_apart
 from .metrics.registration import end_by_registration
-from .metrics.summary import summarize
 
 RUNS: Final = {  # estimator of each run
     "online": registry.DEFAULT_ONLINE,
@@ -41,11 +43,13 @@ ERRORS: Final = {  # errors of the sensor in the table, with titles and units
 
 @dataclass(frozen=True, eq=False)
 class RealDrive:
-    """A log, its runs, and their references."""
+    """A log, its runs by their names in `RUNS`, and their references."""
 
     name: str
     log: Log
-    runs: dict[str, RunResult]
+    maps: dict[str, Map]
+    ends: dict[str, Array]  # last pose (3,) of each run
+    rows: dict[str, dict[str, Any]]  # metrics of each run
     dead_reckoned: Array  # last pose (3,) by odometry alone
     registered: Array | None  # last pose (3,) by registration, where the drive comes back to its beginning
 
@@ -57,16 +61,30 @@ class RealDrive:
         return float(np.hypot(*(pose[:2] - self.registered[:2]))), float(np.rad2deg(turn))
 
 
-def map_real_log(folder: Path, out: Path) -> RealDrive:
-    """Map a log that `convert` has written by all estimators of `RUNS`, and write the maps to `out`."""
-    settings, runs = MapperSettings(), {}
-    log, hints = read_plausible_log(folder, settings.limits)
-    for name, estimator in RUNS.items():
-        runs[name] = run_estimator(estimator, settings, log)
-        write_result(out / folder.name / name, runs[name], summarize(runs[name], log, hints))
-    cycles, _ = seen_cycles(log)
-    end = None if log.measured is None else end_by_registration(cycles, log.measured)
-    return RealDrive(folder.name, log, runs, cycles[-1].pose, end)
+def map_real_logs(logs: Sequence[Path], out: Path, **how: Any) -> list[RealDrive]:
+    """Map logs that `convert` has written by all estimators of `RUNS`; `how` is that of `run_records`."""
+    folders = {folder.name: (folder,) for folder in logs}
+    plan = make_plan(Study(name="real", logs=folders, estimators=tuple(RUNS.values())), keep=True)
+    records = run_records(plan, out, **how)
+    return [_drive(plan.cells[i : i + len(RUNS)], out, records) for i in range(0, len(plan.cells), len(RUNS))]
+
+
+def _drive(cells: Sequence[EstimatorCell], out: Path, records: Mapping[str, Record]) -> RealDrive:
+    """Return the drive of the cells of a log, one for each of `RUNS`; SolveError where one has failed."""
+    if failed := [one for cell in cells if (one := records[cell.id]["failure"])]:
+        raise SolveError(f"{cells[0].drive.source}: {failed[0]}")
+    runs = {name: run_folder(out, cell) for name, cell in zip(RUNS, cells, strict=True)}
+    log, _ = cells[0].drive.load()
+    seen, _ = seen_cycles(log)
+    return RealDrive(
+        cells[0].drive.source,
+        log,
+        {name: read_map(folder) for name, folder in runs.items()},
+        {name: read_trajectory(folder / TRAJECTORY_FILE)[1][-1] for name, folder in runs.items()},
+        {name: records[cell.id]["rows"][-1] for name, cell in zip(RUNS, cells, strict=True)},
+        seen[-1].pose,
+        None if log.measured is None else end_by_registration(seen, log.measured),
+    )
 
 
 def runs_table(drives: Sequence[RealDrive]) -> Table:
@@ -78,14 +96,12 @@ def runs_table(drives: Sequence[RealDrive]) -> Table:
     )
     rows = []
     for drive in drives:
-        for name, run in drive.runs.items():
-            health = [record.health for record in run.cycles]
-            shares = [100.0 * health.count(word) / len(health) for word in ("degraded", "lost")]
+        for name, row in drive.rows.items():
             reckoned = drive.off(drive.dead_reckoned) if name == "online" else (np.nan, np.nan)
-            crossed = (np.nan, np.nan) if name == "landmarks" else crossings(run.map)
-            ms = np.nan if name == "batch" else 1e3 * float(np.mean([r.seconds for r in run.cycles]))
-            values = [100.0 * run.map.closed, *drive.off(run.trajectory[-1]), *reckoned, *crossed]
-            values += [*(shares if any(health) else (np.nan, np.nan)), ms]
+            crossed = (np.nan, np.nan) if name == "landmarks" else crossings(drive.maps[name])
+            values = [100.0 * row["closed_at_end"], *drive.off(drive.ends[name]), *reckoned, *crossed]
+            values += [100.0 * row.get(f"reported_{word}", np.nan) for word in ("degraded", "lost")]
+            values.append(row.get("ms_processor", np.nan))
             rows.append((f"{drive.name}, {name}", *Quantity.row(values, 0, 2, 1, 2, 1, 0, 0, 1, 1, 1)))
     return Table(header, tuple(rows))
 
@@ -94,8 +110,8 @@ def maps_table(drives: Sequence[RealDrive]) -> Table:
     """Return the distance between the maps of each two drives around the same cones: under a metre."""
     rows = []
     for first, second in combinations(drives, 2):
-        both = zip(first.runs.values(), second.runs.values(), strict=True)
-        apart = [aligned_distance(one.map, other.map) for one, other in both]
+        both = zip(first.maps.values(), second.maps.values(), strict=True)
+        apart = [aligned_distance(one, other) for one, other in both]
         if min(apart) < 1.0:
             rows.append((f"{first.name}, {second.name}", *Quantity.row(apart, 2)))
     return Table(("maps", *(f"{name} [m]" for name in RUNS)), tuple(rows))
@@ -103,7 +119,7 @@ def maps_table(drives: Sequence[RealDrive]) -> Table:
 
 def joint_table(drives: Sequence[RealDrive]) -> Table:
     """Return how far each drive's own batch is from that of all drives, and both from the last pose."""
-    alone = {drive.name: run for drive in drives if isinstance(run := drive.runs["batch"], BatchResult)}
+    alone = {drive.name: solve_alone(drive.log) for drive in drives}
     joint, rows = join(alone), []
     for drive in drives:
         if drive.name not in joint.drives:

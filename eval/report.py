@@ -16,19 +16,20 @@ from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.sim.mistakes import MISTAKES
 
-from . import real, views
+from . import hints, joint, known, real, views
 from .benchmark.measurement import figures, measure_drive
 from .benchmark.roads import QUICK, make_drives
 from .benchmark.scaling import measure_scaling, scaling_table
+from .cars import on_tracks
+from .experiment.drives import Drive, load_tracks
 from .experiment.faults import at_strength, fault_table, kinds, only, outcomes, suite
 from .experiment.frame import write_csv
 from .experiment.provenance import made
+from .experiment.rows import RowsOf, rows_of
 from .experiment.run import run_study
 from .experiment.study import Baseline, Study, find_study, read_study_file
 from .experiment.tables import Quantity, Table
-from .hints import HintStudy
-from .joint import JointStudy, joint_table
-from .known import KnownStudy, known_table
+from .metrics.reference import landmark_limit
 from .views import ESTIMATORS, LANDMARKS, ONLINE
 
 ABLATIONS: Final = ("stations", "gauge", "robust", "density", "lag", "relinearize", "degree", "covariance")
@@ -99,7 +100,12 @@ class Plan:
 
     def camera(self, folder: Path) -> Tables:
         """Drive the study `camera` with one seed, whose noise is another one on each track."""
-        return {"": views.camera_table(self._shipped("camera", folder, seeds=(0,))[1], CAMERA)}
+        study, frame = self._shipped("camera", folder, seeds=(0,))
+        (noise,), (seed,), tracks = study.noise, study.seeds, load_tracks(study.tracks)
+        drives = [Drive(track, seed, noise, study.simulation(noise)) for track in tracks]
+        parts = [{"track": d.track, "settings": d.simulation, "seed": d.own_seed} for d in drives]
+        limits = self._rows(landmark_limit, parts, folder / "landmarks")
+        return {"": views.camera_table(frame, limits, CAMERA)}
 
     def hard(self, folder: Path) -> Tables:
         study, frame = self._shipped("hard", folder, seeds=(0,))
@@ -140,17 +146,16 @@ class Plan:
         return {"": fault_table(study, outcomes(study, self._run(study, folder)))}
 
     def hints(self, folder: Path) -> Tables:
-        small: dict[str, Any] = {"mistakes": tuple(MISTAKES)[:2]} if self.quick else {}
-        study = HintStudy(tracks=GENERATED[: 1 if self.quick else 3], seeds=(0,), **small)
-        return {"": views.hints_table(study.measure(folder=folder, **self._how))}
+        tracks, mistakes = (GENERATED[:1], [*MISTAKES][:2]) if self.quick else (GENERATED, [*MISTAKES])
+        return {"": hints.hints_table(self._rows(hints.judge, hints.parts_of(tracks, mistakes), folder))}
 
     def joint(self, folder: Path) -> Tables:
-        small: dict[str, Any] = {"tracks": (50,), "drives": 2} if self.quick else {}
-        return {"": joint_table(JointStudy(**small).measure(folder=folder, **self._how))}
+        tracks, drives = ((50,), 2) if self.quick else ((50, 51, 52), 8)
+        return {"": joint.joint_table(self._rows(joint.of_track, on_tracks(tracks, drives=drives), folder))}
 
     def known(self, folder: Path) -> Tables:
-        small: dict[str, Any] = {"tracks": (60,), "begins": (0.3,)} if self.quick else {}
-        return {"": known_table(KnownStudy(**small).measure(folder=folder, **self._how))}
+        tracks, begins = ((60,), (0.3,)) if self.quick else (range(60, 68), (0.0, 0.3, 0.6))
+        return {"": known.known_table(self._rows(known.of_track, on_tracks(tracks, begins=begins), folder))}
 
     def speed(self, _: Path) -> Tables:
         """Time every estimator in turn on the same cycles."""
@@ -163,7 +168,7 @@ class Plan:
     def real_logs(self, folder: Path) -> Tables:
         if not self.real:
             raise SettingsError("--only real: expected logs in --real, found none")
-        drives = [real.map_real_log(log, folder) for log in self.real]
+        drives = real.map_real_logs(self.real, folder, **self._how)
         return {
             "runs": real.runs_table(drives),
             "maps": real.maps_table(drives),
@@ -187,6 +192,9 @@ class Plan:
 
     def _run(self, study: Study, folder: Path) -> pd.DataFrame:
         return run_study(study, folder, **self._how)
+
+    def _rows(self, function: RowsOf, parts: list[dict[str, Any]], folder: Path) -> pd.DataFrame:
+        return rows_of(function, parts, folder, **self._how)
 
     @property
     def _how(self) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from typing import Final
 
 import pandas as pd
 
-from .experiment.frame import RUN, RUN_OF, TIMES, contrasts, last_laps
+from .experiment.frame import RUN_OF, TIMES, contrasts, last_laps
 from .experiment.statistics import by_track
 from .experiment.study import Study
 from .experiment.tables import Quantity, Table, names_of
@@ -73,11 +73,10 @@ def skidpad_table(frame: pd.DataFrame) -> Table:
     return runs_table(frame.assign(ate=square**0.5), ("estimator",), ("ate", "rmse", "missed"))
 
 
-def camera_table(frame: pd.DataFrame, keys: Sequence[str]) -> Table:
-    """Return the map of each estimator on drawn cars, and the rmse that the landmarks' limit allows."""
+def camera_table(frame: pd.DataFrame, limits: pd.DataFrame, keys: Sequence[str]) -> Table:
+    """Return the map of each estimator on drawn cars, and the rmse of landmarks that are told all."""
     table = runs_table(frame, ("estimator",), keys)
-    limit = _figure("l", last_laps(frame).drop_duplicates([*RUN]))  # one of each drive
-    row = ("landmarks, given all", limit, *[Quantity(None)] * (len(keys) - 1))
+    row = ("landmarks, given all", _figure("rmse", limits), *[Quantity(None)] * (len(keys) - 1))
     return replace(table, rows=(*table.rows, row))
 
 
@@ -95,15 +94,6 @@ def study_table(study: Study, frame: pd.DataFrame) -> Table:
         rows.append((", ".join(names), _figure(first, part), *tested, *rest))
     heading, *headings = (METRICS[key].heading for key in (first, *others))
     return Table((", ".join(several), heading, "difference", "p", *headings), tuple(rows))
-
-
-def hints_table(rows: pd.DataFrame) -> Table:
-    """Return the number of logs whose cause is named, for each mistake, or that are accused."""
-    spoiled, good = rows[rows["kind"] == "spoiled"], rows[rows["kind"] == "good"]
-    groups = {str(name): of["named"] for name, of in spoiled.groupby("name", sort=False)}
-    groups |= {"all mistakes": spoiled["named"], "good logs, accused of any": good["accused"]}
-    figures = tuple((name, *Quantity.row((hits.sum(), len(hits)), 0)) for name, hits in groups.items())
-    return Table(("mistake", "named", "logs"), figures)
 
 
 def _parts(frame: pd.DataFrame, *names: str) -> dict[str, pd.DataFrame]:

@@ -51,7 +51,7 @@ GROUPS: Final = {
     },
 }
 EXTRAS: Final = {  # packages that the core does without, and the extra that has them
-    **dict.fromkeys(("pandas", "tabulate", "matplotlib", "PIL"), "eval"),
+    **dict.fromkeys(("pandas", "tabulate", "matplotlib"), "eval"),
     "distributed": "cluster",
 }
 COMMANDS: Final = {name: command for group in GROUPS.values() for name, command in group.items()}

@@ -180,7 +180,6 @@ ASSIGNED = {
     "batch.association": {"state.pose_u"},
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"track.detections.used", "state.pose_u"},
-    "eval.view.animation": {"writer.fig"},  # of matplotlib
     "graph.changes": {f"smoother.{part}" for part in ("prior", "submaps", "inactive", "held")}
     | {"smoother.variables.first_cycle"},
     "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},

@@ -1,23 +1,17 @@
-"""Time of an update against the size of the map, its detections and the laps: table and figures."""
+"""Time of an update against the size of the map, its detections and the laps: table and figure."""
 
 import math
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
 
-try:
-    import resource
-except ImportError:  # Windows does not say how much memory was used at most
-    resource = None  # type: ignore[assignment]
-
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
 
 from pathspace_graph.eval.experiment.frame import write_csv
 from pathspace_graph.eval.experiment.provenance import code_of
@@ -41,7 +35,6 @@ _HEIGHT: Final = 3.1  # height of a figure (in)
 _TITLES: Final[dict[Sweep, tuple[str, str]]] = {  # axis title and title of each panel
     CONES: ("cones seen", "(a) map size"),
     READINGS: ("detections per update", "(b) detections"),
-    LAPS: ("lap", "time per lap on a closed road"),
 }
 
 
@@ -150,16 +143,14 @@ def stops(scaling: Scaling) -> list[str]:
 
 
 def write_scaling(out: Path, scaling: Scaling) -> None:
-    """Write `points.csv`, `scaling.json` (with slopes and settings), `table.md` and two figures."""
+    """Write `points.csv`, `scaling.json` (with slopes and settings), `table.md` and the figure."""
     at = {name: scaling.seconds_at(COMPARED_AT, name) for name in scaling.estimators}
     content = {
         "format": "pathspace-scaling/1",
         "slopes": scaling.slopes.to_dict("records"),
         "compared_at_cones": COMPARED_AT,
         "seconds_compared": at,
-        "ratio_of_first": {name: at[scaling.estimators[0]] / seconds for name, seconds in at.items()},
         "peak_megabytes_tracemalloc_first_lap": scaling.memory,
-        "peak_megabytes_of_the_process": _process_megabytes(),
         "settings": asdict(scaling.settings),
         "estimator_settings": scaling.mapper,
         "versions": versions(),
@@ -168,15 +159,7 @@ def write_scaling(out: Path, scaling: Scaling) -> None:
         write_csv(folder / "points.csv", scaling.points)
         scaling_table(scaling).write(folder, "table", "md")
         write_json(folder / MARKER, content)
-        style.save_figures(folder, {"scaling": plot_scaling(scaling), "laps": plot_laps(scaling)})
-
-
-def _process_megabytes() -> float | None:
-    """Return the most memory (MB) that the process had, with all estimators loaded; None if unknown."""
-    if resource is None:
-        return None
-    unit = 1e-6 if platform.system() == "Darwin" else 1.024e-3
-    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        style.save_figures(folder, {"scaling": plot_scaling(scaling)})
 
 
 def plot_scaling(scaling: Scaling) -> Figure:
@@ -201,26 +184,14 @@ def plot_scaling(scaling: Scaling) -> Figure:
     return figure
 
 
-def plot_laps(scaling: Scaling) -> Figure:
-    """Draw the time per update of each lap, from the first on."""
-    with style.figure_context():
-        figure = Figure(figsize=(WIDTH / 2, _HEIGHT), layout="constrained")
-        axes = figure.subplots()
-        _draw_sweep(axes, scaling, LAPS, linestyle="-")
-        axes.set_ylabel("mean update [ms]")
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        style.shared_legend(figure, columns=2)
-    return figure
-
-
-def _draw_sweep(axes: Axes, scaling: Scaling, sweep: Sweep, linestyle: str = "none") -> dict[str, str]:
+def _draw_sweep(axes: Axes, scaling: Scaling, sweep: Sweep) -> dict[str, str]:
     drawn: dict[str, str] = {}
     for name, color, marker in zip(scaling.estimators, cycle(PALETTE), cycle(MARKERS), strict=False):
         points = scaling.of(sweep, name)
         if len(points):
             look: dict[str, Any] = {"linewidth": 0.7, "marker": marker, "markersize": 3.6}
             milliseconds = 1e3 * points["seconds"]
-            axes.plot(points["at"], milliseconds, linestyle=linestyle, color=color, label=name, **look)
+            axes.plot(points["at"], milliseconds, linestyle="none", color=color, label=name, **look)
             drawn[name] = color
     abscissa, title = _TITLES[sweep]
     axes.set(yscale="log", xlabel=abscissa, title=title)

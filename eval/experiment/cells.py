@@ -19,7 +19,6 @@ from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.plausibility.diagnosis import diagnose
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.run import run_online, with_own
-from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .drives import AnyDrive, identity
@@ -34,9 +33,7 @@ class EstimatorCell(Cell):
     estimator: str
     settings: MapperSettings
     variant: str  # name of the settings
-    ghosts: GhostSettings
     parameters: Any = None  # the estimator's own, a frozen dataclass; None where it has none
-    reference_limits: bool = False  # whether the limit of the run is computed, by another batch
 
     @property
     def module(self) -> str:
@@ -52,7 +49,7 @@ class EstimatorCell(Cell):
         settings = {name: value for name, value in known if registry.reads(self.estimator, name)}
         own = None if self.parameters is None else to_plain(asdict(self.parameters))
         parts = {"drive": self.drive.id, "estimator": self.estimator, "settings": settings, "own": own}
-        return identity(**parts, reference_limits=self.reference_limits, ghosts=self.ghosts.distance)
+        return identity(**parts)
 
     def run(self) -> Record:
         log, hints = self.drive.load()
@@ -61,7 +58,7 @@ class EstimatorCell(Cell):
         wall, processor = time.perf_counter() - begin - result.observing, time.thread_time() - worked
         cycles = online_cycles(result)
         took = wall, sum(record.processor for record in cycles) if cycles else processor
-        rows = measure(result, log, took, self.ghosts, reference_limits=self.reference_limits)
+        rows = measure(result, log, took)
         said = [record.notice for record in result.cycles if record.notice]
         said += [] if result.vehicle is None else diagnose(result.vehicle, result.settings, result.scale)
         return {

@@ -1,4 +1,4 @@
-"""Every estimator on the same logs: the paper's Table 1, all metrics, paired differences, and all files."""
+"""Every estimator on the same logs: the paper's Table 1, all metrics, and all files."""
 
 import shutil
 from collections.abc import Mapping, Sequence
@@ -15,23 +15,22 @@ from pathspace_graph import estimators as registry
 from pathspace_graph.errors import check_name
 from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
-from pathspace_graph.eval.metrics.metric import MEAN_DIGITS, METRICS, PAPER, Metric
+from pathspace_graph.eval.metrics.metric import METRICS, PAPER
 from pathspace_graph.eval.metrics.summary import has_cones, versions
 from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.overrides import Overrides
 from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory
-from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .cells import EstimatorCell
 from .drives import log_folders
 from .frame import add_batch, write_csv
-from .plots import Drawn, blind_spot_figure, plot_maps
+from .plots import Drawn, plot_maps
 from .run import Plan, make_plan, run_records
 from .runner import Record, run_folder
-from .statistics import Estimate, difference, estimate
-from .study import Baseline, Study
+from .statistics import estimate
+from .study import Study
 from .tables import Quantity, Table
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
@@ -39,43 +38,32 @@ RUN: Final = ("log", "estimator")
 WITHOUT_TRUTH: Final = (  # metrics that say something of a log without true cones
     *("size", "closed_at_end", "end_off", "crossings", "reported_degraded", "reported_lost", "ms_mean"),
 )
-_PAIRED: Final = ("rmse", "rmse_capped", "missed", "missed_2m", "missed_1m", "ate", *WITHOUT_TRUTH)
-"""Metrics whose differences are in the table; the file has all."""
 
 
 def plan_of(
     logs: Path,
     estimators: Sequence[str] = (),
-    reference: str | None = None,
     settings: MapperSettings | None = None,
-    ghosts: GhostSettings | None = None,
     own: Overrides | None = None,
 ) -> Plan:
-    """Return the plan of every estimator, or those named, on a log or a folder of logs.
-
-    The others are compared with the reference: the default estimator if it is among them, or else the first.
-    """
+    """Return the plan of every estimator, or those named, on a log or a folder of logs."""
     known = registry.known_estimators()
     for name in estimators:
         check_name(name, known, "--estimators: expected a known estimator")
     chosen = tuple(dict.fromkeys(estimators or known))
-    if reference is not None:
-        check_name(reference, chosen, "--reference: expected an estimator that is compared")
-    default = registry.DEFAULT_ONLINE if registry.DEFAULT_ONLINE in chosen else chosen[0]
     study = Study(
         name="comparison",
         logs={name: (folder,) for name, folder in log_folders(logs).items()},
         estimators=chosen,
         settings=settings or MapperSettings(),
         own=own or {},
-        baseline=Baseline(estimator=reference or default),
     )
-    return make_plan(study, keep=True, ghosts=ghosts)
+    return make_plan(study, keep=True)
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """All results, log by log; the estimators are compared with one of them, the reference."""
+    """All results, log by log."""
 
     plan: Plan
     records: Mapping[str, Record]  # by the cell
@@ -117,18 +105,9 @@ class Comparison:
     def estimators(self) -> tuple[str, ...]:
         return self.plan.study.estimators
 
-    @property
-    def reference(self) -> str:
-        return str(self.plan.study.baseline.estimator)
-
     @cached_property
     def has_truth(self) -> bool:
         return "rmse" in self.frame or any(has_cones(cell.drive.load()[0].truth) for cell in self.plan.cells)
-
-    @property
-    def paired(self) -> bool:
-        """Whether there are differences to show: several estimators on several logs."""
-        return len(self.logs) > 1 and len(self.estimators) > 1
 
     @property
     def failures(self) -> list[dict[str, Any]]:
@@ -157,10 +136,9 @@ def _names(cell: EstimatorCell) -> dict[str, Any]:
 
 
 def tables(comparison: Comparison) -> dict[str, Table]:
-    """Return the tables by the name of their files, differences only where runs can be paired."""
+    """Return the tables by the name of their files."""
     short = paper_table(comparison) if comparison.has_truth else final_table(comparison, WITHOUT_TRUTH)
-    found = {"table": short, "metrics": final_table(comparison)}
-    return found | ({"paired": paired_table(comparison)} if comparison.paired else {})
+    return {"table": short, "metrics": final_table(comparison)}
 
 
 def paper_frame(comparison: Comparison) -> pd.DataFrame:
@@ -205,41 +183,6 @@ def final_table(comparison: Comparison, keys: Sequence[str] = tuple(METRICS)) ->
     return Table(("metric", *names), tuple(rows), _title(comparison, "at the end of the log"))
 
 
-def paired_frame(comparison: Comparison) -> pd.DataFrame:
-    """Return a tidy row for each estimator and metric of whole logs: its difference from the reference."""
-    reference, rows = comparison.reference, []
-    final = comparison.final.set_index([*RUN]).unstack("estimator")
-    keys = [key for key in METRICS if key in final]
-    for estimator in (name for name in comparison.estimators if name != reference):
-        for key in keys:
-            values = final[key].reindex(columns=[estimator, reference]).to_numpy(float)
-            d = difference(*values.T)
-            rows.append([estimator, reference, key, d.mean, d.low, d.high, d.count])
-    return pd.DataFrame(rows, columns=["estimator", "reference", "metric", "mean", "low", "high", "pairs"])
-
-
-def paired_table(comparison: Comparison) -> Table:
-    """Return the differences with their intervals: a row for each metric, a column for each estimator."""
-    paired = paired_frame(comparison)
-    others = [name for name in comparison.estimators if name != comparison.reference]
-    rows = []
-    for metric in (METRICS[key] for key in _PAIRED):
-        by_estimator = paired[paired["metric"] == metric.key].set_index("estimator")
-        if by_estimator["mean"].notna().any():
-            rows.append((metric.heading, *(_difference(metric, by_estimator.loc[name]) for name in others)))
-    title = (
-        f"Difference from {comparison.reference}, mean and 95 % interval over {len(comparison.logs)} logs, "
-        "paired; * where 0 is outside of it. Positive: the reference has less."
-    )
-    return Table(("metric", *others), tuple(rows), title)
-
-
-def _difference(metric: Metric, row: pd.Series) -> str:
-    of = Estimate(row["mean"], row["high"] - row["mean"], row["pairs"])
-    mark = "*" if of.low > 0.0 or of.high < 0.0 else ""
-    return f"{Quantity.estimated(of, max(metric.digits, MEAN_DIGITS), metric.factor, '+')}{mark}"
-
-
 def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> Table:
     """Return Table 1 as in the paper: a row per lap, with rmse, missed and size under each estimator."""
     titles = "   ".join(metric.heading for metric in PAPER)
@@ -267,8 +210,6 @@ def write_comparison(out: Path, comparison: Comparison, jobs: int) -> None:
     Each of several logs has a folder of its own. An earlier comparison in `out` becomes a numbered backup.
     """
     frames = {"table": paper_frame(comparison), "metrics": comparison.frame, "times": comparison.times()}
-    if comparison.paired:
-        frames["paired"] = paired_frame(comparison)
     with atomic_folder(out, MARKER) as folder:
         for name, table in tables(comparison).items():
             table.write(folder, name, "md", "tex")
@@ -280,7 +221,6 @@ def write_comparison(out: Path, comparison: Comparison, jobs: int) -> None:
             "format": "pathspace-comparison/1",
             "logs": comparison.logs,
             "estimators": comparison.estimators,
-            "reference": comparison.reference,
             "failures": comparison.failures,
             "jobs": jobs,
             "settings": asdict(comparison.plan.study.settings),
@@ -302,7 +242,3 @@ def _write_log(folder: Path, name: str, comparison: Comparison) -> None:
         truth = cell.drive.load()[0].truth
     if drawn:
         save_figures(folder, {"maps": plot_maps(drawn, truth)})
-    if truth is not None and comparison.reference in drawn:
-        maps = {estimator: one.map for estimator, one in drawn.items()}
-        figure = blind_spot_figure(maps, comparison.reference, truth)
-        save_figures(folder, {} if figure is None else {"blind_spot": figure})

@@ -4,19 +4,14 @@ import json
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from pathspace_graph.errors import SettingsError, check_name
-from pathspace_graph.eval.figures import style
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, ORANGE, WIDTH
 from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.io.files import write_json
 from pathspace_graph.plausibility.diagnosis import PRIOR_LIMIT
@@ -26,7 +21,6 @@ from .study import Study, find_study, read_study_file
 from .tables import Quantity, Table
 
 CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
-FAULT_COLUMNS: Final = 4  # panels side by side in the figure of faults
 Values = Mapping[str, Any]  # values of an outcome by name
 COLUMNS: Final = {  # of the table of faults: value and digits
     "runs": ("runs", 0),
@@ -50,15 +44,13 @@ _MEASURED: Final = (
     *("rmse", "size", "missed", "closed_at_end", "lost_at_end"),
     *("reported_degraded", "reported_lost", *_WORST),
 )
-_NAME: Final = re.compile(r"(?P<kind>.+): (?P<strength>(?P<value>[-+.\d]+)(?: (?P<unit>\S+))?)")
+_NAME: Final = re.compile(r"(?P<kind>.+): (?P<value>[-+]?\d+(\.\d+)?)( (?P<unit>\S+))?")
 
 
-@dataclass(frozen=True)
-class Fault:
-    """A fault of a kind and a strength."""
+class Fault(NamedTuple):
+    """A fault of a kind, and its strength."""
 
     kind: str
-    strength: str  # as it is written, a number and a unit
     value: float
     unit: str
 
@@ -66,14 +58,11 @@ class Fault:
 def fault_of(noise: str) -> Fault:
     """Return the fault of a noise such as `latency: 20 ms`; SettingsError for any other name."""
     if noise == CLEAN:
-        return Fault(CLEAN, "", 0.0, "")
+        return Fault(CLEAN, 0.0, "")
     match = _NAME.fullmatch(noise)
-    try:
-        value = float(match["value"] if match else "")
-    except ValueError as error:
-        raise SettingsError(f"noise: expected a name such as 'latency: 20 ms', found '{noise}'") from error
-    assert match is not None
-    return Fault(match["kind"], match["strength"], value, match["unit"] or "")
+    if match is None:
+        raise SettingsError(f"noise: expected a name such as 'latency: 20 ms', found '{noise}'")
+    return Fault(match["kind"], float(match["value"]), match["unit"] or "")
 
 
 def suite() -> Study:
@@ -185,65 +174,11 @@ def _notices(values: Values) -> str:
     return "; ".join(said) or "nothing"
 
 
-# --- figure and files ------------------------------------------------------------------------------------
-
-
-def plot_faults(study: Study, runs: pd.DataFrame) -> Figure:
-    """Draw a panel for each kind of fault: the mean and the runs of `beside_clean`, filled if told."""
-    panels = [noises for noises in by_kind(study) if noises != [CLEAN]]
-    rows = max(1, -(-len(panels) // FAULT_COLUMNS))
-    with style.figure_context():
-        figure = Figure(figsize=(WIDTH, 0.5 + 1.45 * rows), layout="constrained")
-        every = figure.subplots(rows, FAULT_COLUMNS, sharey=True, squeeze=False).ravel()
-        for axes, noises in zip(every, panels, strict=False):
-            _draw_fault(axes, noises, runs)
-        for axes in every[len(panels) :]:
-            axes.set_visible(False)
-        ratios = np.append(runs["ratio"].dropna(), 1.0)
-        every[0].set_yscale("log")
-        every[0].set_ylim(ratios.min() / 1.15, ratios.max() * 1.15)
-        style.label_logarithms(every[0])
-        figure.supylabel("rmse by that of the clean run")
-        style.shared_legend(figure, columns=6)
-    return figure
-
-
-def _draw_fault(axes: Axes, noises: Sequence[str], runs: pd.DataFrame) -> None:
-    axes.axhline(1.0, color=DARK, linewidth=0.6)
-    means = []
-    for at, noise in enumerate(noises):
-        own = runs[runs["noise"] == noise]
-        means.append(own["ratio"].mean())
-        spread = 0.15 if len(own) > 1 else 0.0
-        places = at + np.linspace(-spread, spread, len(own))
-        for place, *run in zip(places, own["ratio"], own["lost_at_end"] == 1.0, own["reported"], strict=True):
-            _draw_faulty_run(axes, float(place), *run)
-    known = np.flatnonzero(~np.isnan(means))
-    if len(known):
-        axes.plot(known, np.array(means)[known], color=BLUE, linewidth=0.9, label="mean", zorder=1)
-    faults = [fault_of(noise) for noise in noises]
-    axes.set_xticks(range(len(faults)), [f"{fault.value:g}" for fault in faults])
-    axes.set_xlim(-0.5, len(faults) - 0.5)
-    title = f"{faults[0].kind} [{faults[0].unit}]".removesuffix(" []")
-    cut = title.rfind(" ", 0, 30) if len(title) > 30 else 0
-    axes.set_title(f"{title[:cut]}\n{title[cut + 1 :]}" if cut > 0 else title)
-    axes.grid(axis="y")
-
-
-def _draw_faulty_run(axes: Axes, at: float, ratio: float, lost: bool, told: bool) -> None:
-    """Draw a triangle where the vehicle is lost at the end, a cross at the top where there is no map."""
-    if np.isnan(ratio):
-        edge = axes.get_xaxis_transform()
-        axes.plot(at, 0.95, "x", color=ORANGE, markersize=4.0, transform=edge, label="no map")
-        return
-    color = ORANGE if lost else GREEN
-    label = f"{'lost at the end' if lost else 'not lost'}{', reported' if told else ''}"
-    look: dict[str, Any] = {"markerfacecolor": color if told else "none", "markersize": 4.0}
-    axes.plot(at, ratio, "^" if lost else "o", color=color, markeredgewidth=0.8, label=label, **look)
+# --- files ---------------------------------------------------------------------------------------------
 
 
 def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
-    """Write the results of every run, and the table, the values and the figure; return the table's text."""
+    """Write the results of every run, the table and the values; return the table's text."""
     faults = outcomes(study, frame)
     table = with_notices(fault_table(study, faults), faults)
     write_results(frame, out)
@@ -254,5 +189,4 @@ def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
     for key in ("calibration", "notices"):  # as JSON texts
         flat[key] = [json.dumps(value, ensure_ascii=False) for value in flat[key]]
     write_csv(out / "faults.csv", flat)
-    style.save_figures(out, {"faults": plot_faults(study, beside_clean(frame))})
     return table.text()

@@ -1,4 +1,4 @@
-"""Maps side by side, the stretch where landmarks miss most cones, and the differences of a study."""
+"""Maps side by side, and the differences of a study."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,74 +8,22 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.spatial import KDTree
 
 from pathspace_graph.eval.figures import map_plot, style
-from pathspace_graph.eval.figures.map_plot import MARGIN, WHOLE_TRACK, MapStyle
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, RED, WIDTH
-from pathspace_graph.eval.metrics.accuracy import MISSED_DISTANCE, cone_distances, mapped_points
+from pathspace_graph.eval.figures.map_plot import MARGIN
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH
+from pathspace_graph.eval.metrics.accuracy import mapped_points
 from pathspace_graph.eval.metrics.metric import METRICS, PAPER
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Truth
-from pathspace_graph.io.map import Map, PointBoundary
-from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.io.map import Map
 
 from .frame import Contrast, contrasts
 from .study import Study
 
 COLUMNS: Final = (2, 3, 4)  # maps side by side; the first with which the figure fits a page is taken
 MAX_HEIGHT: Final = 10.0  # height of a page (in)
-HALF_SIZE: Final = np.array([17.0, 13.0])  # half width and half height of a blind spot's stretch (m)
-DISTANCES: Final = (MISSED_DISTANCE, 2.0, 1.0)  # distances (m) of a missed cone, as they are tried
 MAX_PANELS: Final = 3  # most metrics side by side in the figure of differences
-# style of a panel that shows a short stretch of a track
-CLOSE_UP: Final = MapStyle(curve_width=1.1, marker_size=4.2, landmark_size=3.0, path_width=0.8)
-
-
-@dataclass(frozen=True, eq=False)
-class BlindSpot:
-    """Stretch of the track, and the true cones in it that maps miss."""
-
-    centre: Array  # (2,) centre of the stretch, map frame (m)
-    distance: float  # distance (m) within which nothing is mapped at a missed cone
-    cones: int
-    missed: tuple[Array, ...]  # positions (k, 2) of the cones that each map misses in the stretch
-
-
-def find_blind_spot(truth: Truth, spline_map: Map, landmark_map: Map) -> BlindSpot | None:
-    """Return the stretch where the landmark map misses the most cones that the spline map doesn't, if any.
-
-    They are missed at the largest of `DISTANCES` at which a stretch misses several, else at the largest at
-    which any is missed. Of equal stretches it is the one with the largest total distance, each up to 10 m.
-    """
-    cones = truth.cones[np.isin(truth.cone_labels, BOUNDARIES)]
-    distances = [cone_distances(track, truth) for track in (spline_map, landmark_map)]
-    best: BlindSpot | None = None
-    for distance in DISTANCES:
-        bridged = (distances[0] <= distance) & (distances[1] > distance)
-        if bridged.any():
-            points, weights = cones[bridged], np.minimum(distances[1][bridged], 10.0)
-            near: Any = KDTree(points / HALF_SIZE).query_ball_point(points / HALF_SIZE, 1.0, p=np.inf)
-            chosen = points[max(near, key=lambda members: (len(members), weights[members].sum()))]
-            centre = 0.5 * (chosen.min(axis=0) + chosen.max(axis=0))
-            inside = (np.abs(cones - centre) <= HALF_SIZE).all(axis=1)
-            missed = tuple(cones[inside & (d > distance)] for d in distances)
-            spot = BlindSpot(centre, distance, int(inside.sum()), missed)
-            if len(spot.missed[1]) > 1:
-                return spot
-            best = best or spot
-    return best
-
-
-def blind_spot_figure(maps: Mapping[str, Map], reference: str, truth: Truth) -> Figure | None:
-    """Return the reference beside the first landmark map that misses cones that it passes, or None."""
-    kinds = {name: {type(boundary) for boundary in track.boundaries.values()} for name, track in maps.items()}
-    points = [name for name, own in kinds.items() if PointBoundary in own]
-    for name in points if reference not in points else ():
-        spot = find_blind_spot(truth, maps[reference], maps[name])
-        if spot is not None:
-            return plot_blind_spot(spot, [(reference, maps[reference]), (name, maps[name])], truth)
-    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,29 +50,12 @@ def plot_maps(drawn: Mapping[str, Drawn], truth: Truth | None) -> Figure:
     with style.figure_context():
         figure, panels, columns = _panels(len(drawn), (high - low) / 2.0)
         for axes, (name, one) in zip(panels, drawn.items(), strict=False):
-            _draw_map(axes, one.map, truth, WHOLE_TRACK)
-            map_plot.draw_trajectory(axes, one.path, WHOLE_TRACK)
-            map_plot.draw_start(axes, WHOLE_TRACK)
+            _draw_map(axes, one.map, truth)
+            map_plot.draw_trajectory(axes, one.path)
+            map_plot.draw_start(axes)
             axes.set_title(_caption(name, one.metrics))
             style.set_frame(axes, low, high)
         _finish(figure, panels, len(drawn), columns)
-    return figure
-
-
-def plot_blind_spot(spot: BlindSpot, maps: Sequence[tuple[str, Map]], truth: Truth) -> Figure:
-    """Draw the same area of several maps side by side, with rings around the cones that a map misses."""
-    with style.figure_context():
-        figure, panels, columns = _panels(len(maps), HALF_SIZE)
-        for axes, (name, track), missed in zip(panels, maps, spot.missed, strict=False):
-            _draw_map(axes, track, truth, CLOSE_UP)
-            if (np.abs(spot.centre) < HALF_SIZE).all():
-                map_plot.draw_start(axes, CLOSE_UP)
-            ring = {"markersize": 8.0, "markerfacecolor": "none", "markeredgewidth": 1.0, "zorder": 8}
-            text = f"missed: nothing within {spot.distance:g} m"
-            style.draw_points(axes, missed, "o", RED, text, **ring)
-            axes.set_title(f"{name}\n{len(missed)} of {spot.cones} true cones missed here")
-            style.set_frame(axes, spot.centre - HALF_SIZE, spot.centre + HALF_SIZE)
-        _finish(figure, panels, len(maps), columns)
     return figure
 
 
@@ -155,11 +86,11 @@ def _finish(figure: Figure, panels: list[Axes], used: int, columns: int) -> None
     style.fit_height(figure)
 
 
-def _draw_map(axes: Axes, track: Map, truth: Truth | None, look: MapStyle) -> None:
+def _draw_map(axes: Axes, track: Map, truth: Truth | None) -> None:
     for label, boundary in sorted(track.boundaries.items()):
-        map_plot.draw_boundary(axes, boundary, label, look)
+        map_plot.draw_boundary(axes, boundary, label)
     if truth is not None:
-        map_plot.draw_truth(axes, truth, look)
+        map_plot.draw_truth(axes, truth)
 
 
 def _caption(name: str, row: Mapping[str, Any]) -> str:

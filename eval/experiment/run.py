@@ -16,7 +16,6 @@ from pathspace_graph.eval.metrics.alignment import aligned_distance
 from pathspace_graph.io.files import check_target, remove_manifest, write_json
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.parsing import read_json, shown
-from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.sim.track import Track
 
 from .cells import EstimatorCell
@@ -41,7 +40,7 @@ class Plan:
     def resolved(self) -> dict[str, Any]:
         """Return the content of `study.json`: the study with every default written out."""
         study = self.study
-        same = ("name", "question", "seeds", "laps", "estimators", "varied", "metrics", "columns")
+        same = ("name", "question", "seeds", "laps", "estimators", "varied", "metrics")
         return {
             "format": FORMAT,
             **{name: getattr(study, name) for name in same},
@@ -55,11 +54,10 @@ class Plan:
                 if variant.parameters
             },
             "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
-            "reference_limits": study.reference_limits,
         }
 
 
-def make_plan(study: Study, *, keep: bool = False, ghosts: GhostSettings | None = None) -> Plan:
+def make_plan(study: Study, *, keep: bool = False) -> Plan:
     """Read and generate the tracks, and return the cells, grouped by the log that they share.
 
     With `keep`, the map, trajectory, cycles and summary of each are kept.
@@ -79,9 +77,8 @@ def make_plan(study: Study, *, keep: bool = False, ghosts: GhostSettings | None 
         drives += [RecordedDrive(track, number, folder, limits) for number, folder in enumerate(folders)]
     cells = tuple(
         EstimatorCell(
-            *(drive, estimator, variant.settings, name, ghosts or GhostSettings()),
+            *(drive, estimator, variant.settings, name),
             parameters=dict(variant.parameters).get(estimator),
-            reference_limits=study.reference_limits,
             keep=keep,
             code=code[estimator],
             began=began,

@@ -5,7 +5,6 @@ from typing import Final
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 from scipy import stats
 
 from pathspace_graph.factors.arrays import Array
@@ -23,14 +22,6 @@ class Estimate:
     mean: float  # NaN without samples
     half: float  # half the width of the interval; NaN for fewer than two samples
     count: int  # number of samples
-
-    @property
-    def low(self) -> float:
-        return self.mean - self.half
-
-    @property
-    def high(self) -> float:
-        return self.mean + self.half
 
 
 def by_track(values: pd.Series) -> pd.Series:
@@ -62,13 +53,6 @@ def estimate(values: Array) -> Estimate:
         quantile = float(np.quantile(off[spread > 0.0] / spread[spread > 0.0], LEVEL))
         quantile = min(quantile, float(np.ptp(values)) / sem)
     return Estimate(mean, quantile * sem, n)
-
-
-def difference(values: ArrayLike, reference: ArrayLike) -> Estimate:
-    """Return the estimate of values - reference (n,) over the pairs of which both are finite."""
-    own, others = np.asarray(values, dtype=float), np.asarray(reference, dtype=float)
-    finite = np.isfinite(own) & np.isfinite(others)
-    return estimate(own[finite] - others[finite])
 
 
 def paired_p(differences: Array) -> float:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError, check_name
-from pathspace_graph.eval.metrics.metric import METRICS, column_of
+from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.io.overrides import Overrides, apart, flatten, override
 from pathspace_graph.io.parsing import MAX_HEADER_BYTES, MAX_VARIANTS, parse_toml, read_text, shown
 from pathspace_graph.settings.mapper import MapperSettings
@@ -21,7 +21,7 @@ SHIPPED: Final = Path(__file__).parents[1] / "studies"
 DEFAULT: Final = "default"  # variant that overrides nothing, part of every study
 PRESET: Final = "preset"  # entry of a noise that names a preset, as in `sensor.preset = "camera"`
 ALL: Final = "all"  # name that stands for all known estimators
-_LISTS: Final = ("tracks", "seeds", "estimators", "metrics", "columns")
+_LISTS: Final = ("tracks", "seeds", "estimators", "metrics")
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,6 @@ class Study:
     """Combination that the others are compared with."""
     metrics: tuple[str, ...] = ("rmse", "missed", "size", "ms_mean")
     """Metrics that the summary compares with the baseline."""
-    columns: tuple[str, ...] = ()
-    """Columns of the table by track: `rmse` is the last lap's, `rmse@1` that of lap 1, and
-    `slope(bias, bias_true)` says how much of the truth an estimate has found."""
-    reference_limits: bool = False
-    """Whether to compute the limit of every run, which takes a landmark batch with oracle associations."""
 
     def __post_init__(self) -> None:
         """Raise SettingsError if anything is unknown, empty, named twice or out of its range."""
@@ -88,10 +83,6 @@ class Study:
         if self.estimators == (ALL,):
             object.__setattr__(self, "estimators", tuple(registry.known_estimators()))
         self._check_lists()
-        if not isinstance(self.reference_limits, bool):
-            raise SettingsError(
-                f"reference_limits: expected true or false, found {shown(self.reference_limits)}"
-            )
         if type(self.laps) is not int:
             raise SettingsError(f"laps: expected a whole number, found {shown(self.laps)}")
         if DEFAULT in self.variants:
@@ -125,8 +116,6 @@ class Study:
             check_name(name, registry.known_estimators(), "estimators: expected a known estimator")
         for name in self.metrics:
             check_name(name, METRICS, "metrics: expected a known metric")
-        for column in self.columns:
-            column_of(column)
 
     def simulation(self, noise: str) -> SimulationSettings:
         overrides = dict(self.noise[noise])

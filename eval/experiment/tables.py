@@ -1,6 +1,6 @@
 """Tables in every form, and those of a study."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import repeat
 from math import isfinite, nan
@@ -17,14 +17,11 @@ from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
 from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.metric import (
     HIGHER,
-    LATER_LAPS,
     LOWER,
     MEAN_DIGITS,
     METRICS,
     UNKNOWN,
-    Column,
     Metric,
-    column_of,
 )
 from pathspace_graph.io.files import write_text
 
@@ -291,40 +288,18 @@ def joined(tables: Sequence[Table], caption: str, form: str) -> str:
 
 
 def track_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
-    """Return a table for each combination of noise, estimator and settings, if the study wants columns."""
-    columns = [column_of(text) for text in study.columns]
-    if not columns:
-        return []
-    header = ("track", "runs", *(column.title for column in columns))
-    titles = names_of(frame, "estimator")
-    return [
-        Table(header, tuple(_rows(columns, runs)), ", ".join(str(runs[name].iloc[0]) for name in titles))
-        for _, runs in frame.groupby([*COMBINATION], sort=False)
-    ]
-
-
-def _rows(columns: Sequence[Column], frame: pd.DataFrame) -> Iterator[tuple[str, ...]]:
-    finished = frame.groupby([*RUN], sort=False)["failure"].first() == ""
-    values = [_values(column, frame).reindex(finished.index) for column in columns]
-    for track, done in finished.groupby(level=0, sort=False):
-        texts = (c.text(v.loc[done.index]) for c, v in zip(columns, values, strict=True))
-        yield (str(track), f"{int(done.sum())} of {len(done)}", *texts)
-    for name, over in {"mean": "mean", "median": "median", "largest": "max"}.items():
-        texts = (c.text(v, over) for c, v in zip(columns, values, strict=True))
-        yield (f"all, {name}", f"{int(finished.sum())} of {len(finished)}", *texts)
-
-
-def _values(column: Column, frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a row for each run that finished, by track and seed: the values of the metrics by key."""
-    laps = column.laps
-    done = frame[frame["failure"] == ""] if laps else last_laps(frame)
-    if laps == LATER_LAPS:
-        done = done[done["lap"] > 1]
-    elif laps.isdecimal():
-        done = done[done["lap"] == int(laps)]
-    done = done.reindex(columns=[*RUN, *(metric.key for metric in column.metrics)])
-    by_run = done.groupby([*RUN], sort=False)
-    return pd.DataFrame({m.key: by_run[m.key].agg(m.over) for m in column.metrics})
+    """Return a table for each combination, track by track: the metrics of its runs at their last lap."""
+    shown = [METRICS[key] for key in study.metrics if key in frame]
+    header, titles = ("track", "runs", *(metric.heading for metric in shown)), names_of(frame, "estimator")
+    tables = []
+    for _, runs in frame.groupby([*COMBINATION], sort=False):
+        rows = []
+        for track, of in [*runs.groupby("track", sort=False), ("all", runs)]:
+            last, count = last_laps(of), len(of.groupby([*RUN]))
+            values = (Quantity.measured(m, m.over(last[m.key].astype(float))) for m in shown)
+            rows.append((str(track), f"{len(last)} of {count}", *values))
+        tables.append(Table(header, tuple(rows), ", ".join(str(runs[name].iloc[0]) for name in titles)))
+    return tables
 
 
 # --- files of studies ------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 """Pictures of a map, with its 2-sigma band and the truth if known, and of a log before it is mapped."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -31,20 +30,8 @@ HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
 LABEL_COLORS: Final = {**BOUNDARY_COLORS, UNKNOWN: GREY, **dict.fromkeys(POINTS, RED)}
 BAND_ALPHA: Final = 0.35
 TENTATIVE_DASHES: Final = (0, (4, 2))  # dashes of the stretch of a curve that is not confirmed
-
-
-@dataclass(frozen=True, slots=True)
-class MapStyle:
-    """Line widths and marker sizes (pt), which depend on how much of a track a panel shows."""
-
-    curve_width: float = 0.7
-    path_width: float = 0.6  # width of the trajectory; the true path is thinner
-    marker_size: float = 2.6
-    landmark_size: float = 1.4  # size of landmarks, small enough for their ellipses to be seen
-    widest_band: float = np.inf  # greatest width of a band on either side of its curve (m)
-
-
-WHOLE_TRACK: Final = MapStyle()  # style of a panel that shows a whole track
+PATH_WIDTH: Final = 0.6  # width of the trajectory (pt); the true path is thinner
+LANDMARK_SIZE: Final = 1.4  # size of landmarks (pt), small enough for their ellipses to be seen
 
 
 def plot_map(
@@ -64,7 +51,8 @@ def plot_map(
     It is drawn in another colour where the `health` of its n cycles is not good. Beside a `smoothed` one
     (n, 3) it is drawn thin, as the poses that were estimated at their time.
     The `differences` are places that are not where a known map has them, each marked by a cross.
-    The legend says so where a `band_scale` other than 1 draws the band wider than it is.
+    The band is cut at 3 m, as at the open end of a road. The legend says so where a `band_scale` other than
+    1 draws it wider than it is.
     """
     if not band_scale > 0.0:
         raise SettingsError(f"band_scale: expected a positive number, found {band_scale}")
@@ -73,27 +61,25 @@ def plot_map(
         axes = figure.add_subplot()
         # the legend names what is drawn first before the rest; zorder decides what lies on top
         for label, boundary in sorted(track.boundaries.items()):
-            draw_boundary(axes, boundary, label, WHOLE_TRACK, band_scale)
+            draw_boundary(axes, boundary, label, band_scale)
         for label, cones in sorted(track.points.items()):
-            draw_orange(axes, cones.points, label, WHOLE_TRACK)
+            draw_orange(axes, cones.points, label)
         if len(differences):
             places = np.array(differences)
             style.draw_points(axes, places, "x", PURPLE, "not as the known map", markersize=5.0, zorder=4.6)
         if log is not None and log.truth is not None:
-            draw_truth(axes, log.truth, WHOLE_TRACK)
+            draw_truth(axes, log.truth)
         if smoothed is not None and trajectory is not None and len(smoothed):
-            thin = MapStyle(path_width=0.25)
-            draw_trajectory(axes, np.asarray(trajectory), thin, label="poses as estimated at their time")
+            label = "poses as estimated at their time"
+            draw_trajectory(axes, np.asarray(trajectory), label=label, width=0.25)
             trajectory = smoothed
         if trajectory is not None and len(trajectory):
-            draw_trajectory(axes, np.asarray(trajectory), WHOLE_TRACK, health)
+            draw_trajectory(axes, np.asarray(trajectory), health)
         finish(figure, axes, title)
     return figure
 
 
-def draw_boundary(
-    axes: Axes, boundary: MapBoundary, label: int, look: MapStyle, band_scale: float = 1.0
-) -> None:
+def draw_boundary(axes: Axes, boundary: MapBoundary, label: int, band_scale: float = 1.0) -> None:
     """Draw a curve with its band and control points, or landmarks with their ellipses, in the map frame."""
     color, name = BOUNDARY_COLORS[label], NAMES[label]
     exaggerated = "" if band_scale == 1.0 else f" (drawn {band_scale:g}× as wide)"
@@ -102,62 +88,64 @@ def draw_boundary(
         area: dict[str, Any] = {"facecolor": color, "alpha": BAND_ALPHA, "linewidth": 0.0, "zorder": 2}
         text = f"{name} {style.SIGMAS:g}σ ellipses{exaggerated}"
         axes.add_collection(PolyCollection(list(ellipses), label=text, **area))
-        look_of = {"markersize": look.landmark_size, "zorder": 4}
+        look_of = {"markersize": LANDMARK_SIZE, "zorder": 4}
         style.draw_points(axes, boundary.points, "o", color, f"{name} landmarks", **look_of)
         return
     spline, text = boundary.spline, f"{name} {style.SIGMAS:g}σ band{exaggerated}"
     if boundary.covariance.size:  # the outline of a map has none
-        style.draw_band(axes, boundary, color, text, band_scale, look.widest_band, alpha=BAND_ALPHA)
+        style.draw_band(axes, boundary, color, text, band_scale, alpha=BAND_ALPHA)
     until = boundary.confirmed_until
-    style.draw_curve(axes, spline, color, f"{name} boundary", look.curve_width, (-np.inf, until), zorder=4)
+    style.draw_curve(axes, spline, color, f"{name} boundary", stretch=(-np.inf, until), zorder=4)
     if until < spline.domain[1]:
-        text, dashed = f"{name} tentative", {"linestyle": TENTATIVE_DASHES, "zorder": 4}
-        style.draw_curve(axes, spline, color, text, look.curve_width, (until, np.inf), **dashed)
+        dashed: dict[str, Any] = {"linestyle": TENTATIVE_DASHES, "zorder": 4}
+        style.draw_curve(axes, spline, color, f"{name} tentative", stretch=(until, np.inf), **dashed)
     squares: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 0.6, "zorder": 5}
     points, text = spline.distinct_control_points, f"{name} control points"
-    style.draw_points(axes, points, "s", color, text, markersize=look.marker_size, **squares)
+    style.draw_points(axes, points, "s", color, text, **squares)
 
 
-def draw_orange(axes: Axes, points: Array, label: int, look: MapStyle) -> None:
+def draw_orange(axes: Axes, points: Array, label: int) -> None:
     """Draw orange cones (n, 2) as triangles, those of gates larger, map frame (m)."""
-    size = (2.0 if label == BIG_ORANGE else 1.2) * look.landmark_size
+    size = (2.0 if label == BIG_ORANGE else 1.2) * LANDMARK_SIZE
     name = NAMES[label].replace("_", " ")
     style.draw_points(axes, points, "^", RED, f"{name} cones", markersize=size, zorder=4.5)
 
 
 def draw_trajectory(
-    axes: Axes, trajectory: Array, look: MapStyle, health: Sequence[str] = (), label: str = "trajectory"
+    axes: Axes,
+    trajectory: Array,
+    health: Sequence[str] = (),
+    label: str = "trajectory",
+    width: float = PATH_WIDTH,
 ) -> None:
     """Draw poses (n, 3) or positions (n, 2) as a line, map frame (m), and what wasn't healthy in colour."""
-    line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": look.path_width, "zorder": 3}
-    axes.plot(*trajectory[:, :2].T, label=label, **line)
+    axes.plot(*trajectory[:, :2].T, label=label, color=TRAJECTORY_COLOR, linewidth=width, zorder=3)
     for condition, color in HEALTH_COLORS.items():
         chosen = np.array([word == condition for word in health], bool)
-        if len(chosen) != len(trajectory) or not chosen.any():
-            continue
-        line = {"color": color, "linewidth": 2.0 * look.path_width, "zorder": 3.2}
-        axes.plot(*np.where(chosen[:, None], trajectory[:, :2], np.nan).T, label=condition, **line)
+        if len(chosen) == len(trajectory) and chosen.any():
+            unhealthy = np.where(chosen[:, None], trajectory[:, :2], np.nan).T
+            axes.plot(*unhealthy, label=condition, color=color, linewidth=2.0 * width, zorder=3.2)
 
 
-def draw_truth(axes: Axes, truth: Truth, look: MapStyle) -> None:
+def draw_truth(axes: Axes, truth: Truth) -> None:
     """Draw the true path dashed and the true cones as crosses, as far as they are known, map frame (m)."""
     if len(truth.poses):
-        line: dict[str, Any] = {"linewidth": 0.6 * look.path_width, "linestyle": (0, (5, 3)), "zorder": 3.5}
+        line: dict[str, Any] = {"linewidth": 0.6 * PATH_WIDTH, "linestyle": (0, (5, 3)), "zorder": 3.5}
         axes.plot(*truth.poses[:, :2].T, color=DARK, label="true path", **line)
     if len(truth.cones):
-        cross = {"markersize": look.marker_size, "markeredgewidth": 0.6}
+        cross = {"markeredgewidth": 0.6}
         style.draw_points(axes, truth.cones, "x", DARK, "true cones", **cross)
 
 
-def draw_start(axes: Axes, look: MapStyle) -> None:
+def draw_start(axes: Axes) -> None:
     """Mark the origin of the map frame, where the vehicle stood first, heading along x."""
-    size = 2.0 * look.marker_size
+    size = 2.0 * style.MARKER_SIZE
     style.draw_points(axes, np.zeros((1, 2)), ">", "black", "start", markersize=size, zorder=7)
 
 
 def finish(figure: Figure, axes: Axes, title: str | None) -> None:
     """Mark the start, add frame, axis titles and legend, and give the figure the map's shape."""
-    draw_start(axes, WHOLE_TRACK)
+    draw_start(axes)
     axes.margins(0.0)
     axes.autoscale_view()
     drawn = np.array([axes.get_xlim(), axes.get_ylim()])
@@ -180,7 +168,7 @@ def plot_apart(first: Map, second: Map, apart: MapsApart, *, title: str | None =
                 if isinstance(boundary, PointBoundary):
                     style.draw_points(axes, points, "o", color, name, markersize=1.4, zorder=3)
                 else:
-                    style.draw_curve(axes, boundary.spline, color, name, 0.7, zorder=3)
+                    style.draw_curve(axes, boundary.spline, color, name, zorder=3)
         points = np.concatenate([*apart.points.values()])
         distances = np.concatenate([*apart.distances.values()])
         order = np.argsort(distances)
@@ -212,9 +200,9 @@ def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
         for label in (label for label in LABEL_COLORS if (labels == label).any()):
             text, own = f"{NAMES[label].replace('_', ' ')} detections", points[labels == label]
             style.draw_points(axes, own, ".", LABEL_COLORS[label], text, **dots)
-        line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": WHOLE_TRACK.path_width, "zorder": 3}
+        line: dict[str, Any] = {"color": TRAJECTORY_COLOR, "linewidth": PATH_WIDTH, "zorder": 3}
         axes.plot(*poses[:, :2].T, label="odometry alone", **line)
         if log.truth is not None:
-            draw_truth(axes, log.truth, WHOLE_TRACK)
+            draw_truth(axes, log.truth)
         finish(figure, axes, title)
     return figure

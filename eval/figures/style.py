@@ -24,8 +24,8 @@ from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.spline.bspline import BSpline
 
 WIDTH: Final = 7.0  # width of a figure (in): two columns of a paper
-CURVE_WIDTH: Final = 1.3  # width of a curve (pt)
-MARKER_SIZE: Final = 4.0  # size of a control point or a detection (pt)
+CURVE_WIDTH: Final = 0.7  # width of a curve (pt)
+MARKER_SIZE: Final = 2.6  # size of a control point or a detection (pt)
 ALPHA: Final = 0.25
 
 BLUE: Final = "#0067A9"
@@ -54,6 +54,7 @@ _RC: Final = {
     "legend.columnspacing": 1.4,
 }
 SIGMAS: Final = 2.0  # standard deviations to the edge of a band or an ellipse
+WIDEST: Final = 3.0  # half width of a band (m) beyond which its curve is not known, and at which it is cut
 FORMATS: Final = (".png", ".pdf", ".svg")  # suffixes under which a figure can be saved
 SUFFIXES: Final = (".png", ".pdf")  # formats of commands that write several figures: to look at, to print
 DPI: Final = 200.0  # resolution of a png (dots per inch)
@@ -136,12 +137,10 @@ def curve_parameters(spline: BSpline, samples_per_span: int = 24) -> Array:
     return np.append(inner.ravel(), breaks[-1])
 
 
-def uncertainty_band(
-    boundary: SplineBoundary, u: Array, scale: float = 1.0, widest: float = np.inf
-) -> tuple[Array, Array]:
-    """Return the left and right edge (k, 2), S(u) +- 2 scale sigma(u) n(u), at most `widest` m off."""
+def uncertainty_band(boundary: SplineBoundary, u: Array, scale: float = 1.0) -> tuple[Array, Array]:
+    """Return the left and right edge (k, 2), S(u) +- scale min(2 sigma(u), WIDEST) n(u)."""
     spline = boundary.spline
-    half = np.minimum(SIGMAS * scale * spline.normal_sigma(u, boundary.covariance), widest)
+    half = scale * np.minimum(SIGMAS * spline.normal_sigma(u, boundary.covariance), WIDEST)
     offsets = half[:, None] * spline.normal_unit(u)
     centre = spline.evaluate(u)
     return centre + offsets, centre - offsets
@@ -184,11 +183,10 @@ def draw_band(
     color: str,
     label: str,
     scale: float = 1.0,
-    widest: float = np.inf,
     **options: Any,
 ) -> None:
-    """Fill the 2-sigma band around a curve, `scale` times as wide as it is, up to `widest` (m) on a side."""
-    left, right = uncertainty_band(boundary, curve_parameters(boundary.spline), scale, widest)
+    """Fill the 2-sigma band around a curve, `scale` times as wide as it is."""
+    left, right = uncertainty_band(boundary, curve_parameters(boundary.spline), scale)
     outline = Outline(np.concatenate([left, right[::-1], left[:1]]), closed=True)
     if boundary.spline.periodic:  # a ring, with edges in opposite directions
         edges = Outline(left, closed=True), Outline(right[::-1], closed=True)

@@ -15,11 +15,13 @@ from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
-from pathspace_graph.settings.evaluation import GhostSettings
 from pathspace_graph.sim.curves import along_polyline, arc_lengths
 from pathspace_graph.spline.bspline import BSpline, segments_cross
 
 MISSED_DISTANCE: Final = 3.0  # distance from its boundary beyond which a cone is missed (m; Table 1)
+GHOST_DISTANCE: Final = (
+    2.0  # beyond which a mapped point is a ghost (m): more than drift, less than a lane of 3 m
+)
 TRUE_STEP: Final = 0.02  # largest step on a true curve (m): 0.1 m is at most 0.5 mm too long
 MAPPED_STEP: Final = 0.1  # largest step on a mapped curve (m)
 GRID_PER_SPAN: Final = 64  # grid points of a span for closest points, about every 0.1 m
@@ -190,13 +192,6 @@ def curve_distance(track: Map, truth: Truth) -> dict[str, float]:
     return {"mapped_to_truth": to_truth, "truth_to_mapped": to_mapped}
 
 
-def two_way_distance(first: MapBoundary, second: MapBoundary) -> float:
-    """Return the mean of both distances (m) between two mapped boundaries."""
-    forth = boundary_distances(second, mapped_points(first))
-    back = boundary_distances(first, mapped_points(second))
-    return 0.5 * (mean_of(forth) + mean_of(back))
-
-
 def crossings(track: Map) -> tuple[int, int]:
     """Return how often the curves of a map cross each other, and how often they cross themselves."""
     chords, owner = [np.zeros((0, 2, 2))], [np.zeros(0)]
@@ -258,18 +253,17 @@ def _crossings(points: Array, normals: Array, expected: Array, curve: Array) -> 
     return offsets
 
 
-def ghosts(track: Map, truth: Truth, settings: GhostSettings | None = None) -> dict[str, float]:
-    """Return the landmarks p and the metres of curve with min_q |p - q| > distance, q on the true curve.
+def ghosts(track: Map, truth: Truth) -> dict[str, float]:
+    """Return the landmarks p and the metres of curve with min_q |p - q| > 2 m, q on the true curve.
 
     The true curve is that of the same boundary. A boundary without any true cone is a ghost as a whole.
     """
-    settings = settings or GhostSettings()
     landmarks, metres = 0, 0.0
     for label, boundary in track.boundaries.items():
         points, curve = mapped_points(boundary), true_curve(truth, label)
         is_ghost = np.ones(len(points), dtype=bool)
         if len(curve) and len(points):
-            is_ghost = np.asarray(KDTree(curve).query(points)[0] > settings.distance)
+            is_ghost = np.asarray(KDTree(curve).query(points)[0] > GHOST_DISTANCE)
         if isinstance(boundary, SplineBoundary):
             metres += float(np.mean(is_ghost)) * boundary.spline.length()
         else:

@@ -14,7 +14,6 @@ from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import by_prior
-from pathspace_graph.settings.evaluation import GhostSettings
 
 from . import accuracy, trajectory
 from .accuracy import true_lap_ends
@@ -26,7 +25,6 @@ from .consistency import (
     turn_from_truth,
     with_marginals,
 )
-from .reference import limit
 from .registration import end_by_registration
 from .summary import has_cones, lap_times
 
@@ -79,24 +77,19 @@ def measure(
     run: RunResult,
     log: Log,
     took: tuple[float, float] | None = None,
-    ghost_settings: GhostSettings | None = None,
-    *,
-    reference_limits: bool = False,
 ) -> list[Row]:
     """Return a row for each complete lap, and one for the whole run as the last; lengths are over the scale.
 
     A lap's row has the map as it stood at its end, and the poses and updates of its cycles. Laps are the true
     ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and so one
     row, that of the last lap. `took` is the wall time and the processor time of the whole run (s).
-    `reference_limits` asks for `l` and `limit`, by a batch with oracle association (ValueError without
-    associations).
     """
     run, log = run.at_scale_one(), scaled(log, 1.0 / run.scale)
     rows = []
     for lap, track, begin, end in _laps(run, log):
-        of_map = _map_values(track, log.truth, ghost_settings)
+        of_map = _map_values(track, log.truth)
         rows.append(Row(lap, of_map | _drive_values(run, log.truth, begin, end)))
-    values = _map_values(run.map, log.truth, ghost_settings)
+    values = _map_values(run.map, log.truth)
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
     values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log.truth)
     if not has_cones(log.truth):
@@ -111,8 +104,6 @@ def measure(
         }
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
-    if reference_limits:
-        values |= limit(log, run.map)
     if took is not None:
         values["seconds"], values["seconds_processor"] = took
     return [*rows, Row(None, values)]
@@ -136,14 +127,14 @@ def _laps(run: RunResult, log: Log) -> Iterator[tuple[int, Map, float, float]]:
         yield lap, track, ends[index], ends[index + 1]
 
 
-def _map_values(track: Map, truth: Truth | None, ghost_settings: GhostSettings | None) -> dict[str, float]:
+def _map_values(track: Map, truth: Truth | None) -> dict[str, float]:
     """Return the metrics of a map as it stands; without true cones only those that need none."""
     values: dict[str, float] = {"size": track.size, "closed": bool(track.closed)}
     values |= {"bytes": map_bytes(track), "bytes_covariance": covariance_bytes(track)}
     if not has_cones(truth):
         return values
     values |= accuracy.cone_errors(track, truth) | accuracy.curve_distance(track, truth)
-    values |= accuracy.ghosts(track, truth, ghost_settings)
+    values |= accuracy.ghosts(track, truth)
     values |= _consistency_values(track, truth) | _centre_values(track, truth)
     values |= _whole_map_values(track, truth)
     found = consistency_at_cones(with_marginals(track), truth)

@@ -1,15 +1,11 @@
-"""The metrics: their names, units and averages, and columns of tables of several runs."""
+"""The metrics: their names, units and averages."""
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-import pandas as pd
 from numpy.typing import ArrayLike
-
-from pathspace_graph.errors import SettingsError, check_name
 
 from .accuracy import root_mean_square
 
@@ -17,9 +13,6 @@ FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3, "°": float(np.ra
 """Factors from the shares, bytes and radians of the columns to the units of the tables."""
 MEAN_DIGITS: Final = 2  # least number of digits after the decimal point of a mean with its interval
 UNKNOWN: Final = "–"
-EVERY_LAP: Final = "all"  # suffix of the average over all laps, as in `rmse@all`
-LATER_LAPS: Final = "later"  # suffix of the average over the laps from the second on, as in `rmse@later`
-_SLOPE: Final = re.compile(r"slope\((\w+), (\w+)\)")
 
 
 @dataclass(frozen=True)
@@ -88,8 +81,6 @@ _ALL: Final = (
     Metric("rmse_aligned", "rmse without turn and scale", "m"),
     Metric("turn_from_batch", "turn from the batch", "°", 2, average="rms"),
     Metric("rmse_by_batch", "rmse by that of the batch", digits=2),
-    Metric("l", "limit, landmarks", "m", scope="run"),
-    Metric("limit", "limit", "m", scope="run"),
     Metric("nees", "NEES per degree of freedom", digits=2),
     Metric("inside", "cones within 2σ of the curve", "%", 1),
     Metric("inside_marginals", "cones within 2σ of the marginals", "%", 1),
@@ -141,55 +132,3 @@ LOWER: Final = (  # of which less is better; others, such as a NEES, have no bes
     *("agreement", "ms_mean", "ms_p99", "ms_processor", "seconds", "seconds_processor"),
 )
 METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}  # in the order of tables
-
-
-@dataclass(frozen=True)
-class Column:
-    """A figure of several runs: a metric of one lap or several, or a slope of one metric on another."""
-
-    metric: Metric
-    laps: str = ""  # number of a lap, `later` or `all`; empty for the last lap
-    given: Metric | None = None  # metric on which the slope is taken, if it is a slope
-
-    @property
-    def title(self) -> str:
-        if self.given is not None:
-            return f"slope of {self.metric.title} on {self.given.title}"
-        if self.laps.isdecimal():
-            return f"{self.metric.heading}, lap {self.laps}"
-        return f"{self.metric.heading}, {self.laps} laps" if self.laps else self.metric.heading
-
-    @property
-    def metrics(self) -> list[Metric]:
-        return [self.metric] if self.given is None else [self.metric, self.given]
-
-    def text(self, values: pd.DataFrame, over: str = "mean") -> str:
-        """Return the text of the average over runs, whose metrics are columns by key, or of the slope.
-
-        `median` and `max` are of magnitudes where there are signs; a slope, `sum e t / sum t^2`, has none. It
-        leads through the origin, as estimator and simulator both expect zero.
-        """
-        of = values[self.metric.key].astype(float)
-        if self.given is not None:
-            known = values.astype(float).dropna(subset=[self.metric.key, self.given.key])
-            t = known[self.given.key].to_numpy()
-            moment = float(t @ t) if over == "mean" else 0.0
-            return f"{float(known[self.metric.key].to_numpy() @ t) / moment:.2f}" if moment > 0.0 else UNKNOWN
-        if over == "mean":
-            return self.metric.text(self.metric.over(of))
-        return self.metric.text(float((of.abs() if self.metric.average == "rms" else of).agg(over)))
-
-
-def column_of(text: str) -> Column:
-    """Return a column such as `rmse`, `rmse@1`, `rmse@later`, `rmse@all` or `slope(bias, bias_true)`."""
-    slope = _SLOPE.fullmatch(text)
-    key, _, laps = text.partition("@")
-    for name in slope.groups() if slope else (key,):
-        check_name(name, METRICS, "columns: expected a known metric")
-    if slope is not None:
-        return Column(METRICS[slope[1]], given=METRICS[slope[2]])
-    if laps and laps not in (EVERY_LAP, LATER_LAPS) and not laps.isdecimal():
-        raise SettingsError(
-            f"columns: expected a lap's number, '{LATER_LAPS}' or '{EVERY_LAP}' after @, found '{text}'"
-        )
-    return Column(METRICS[key], laps)

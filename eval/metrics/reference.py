@@ -1,6 +1,7 @@
-"""What a run is held against: the least error to be expected of its log, and another run."""
+"""What a run is compared with: the landmark batch that is told all about its log, and another run."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -9,27 +10,19 @@ from pathspace_graph.baselines.landmark_map import LandmarkState
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.covariances import ray_covariances
 from pathspace_graph.io.log import Detections, Log, Truth
-from pathspace_graph.io.map import Map, SplineBoundary
-from pathspace_graph.io.results import RunResult
-from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import CalibrationSettings
-from pathspace_graph.spline.knots import fit_spline
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track import Track
 
-from . import accuracy
-from .accuracy import closest_points, root_mean_square
-from .trajectory import pose_errors
+from .accuracy import root_mean_square
 
 
-def limit(log: Log, track: Map) -> dict[str, float]:
-    """Return the least error (m) to be expected of a simulated log and a map of it; ValueError for others.
-
-    `l` is the rmse in the plane of the landmark batch with oracle association, `limit` that and the rmse of
-    the true cones to splines of the mapped size that are fitted to them.
-    """
-    truth = truth_of(log)
-    landmarks, fit = landmark_rmse(solve_oracle_landmarks(log)[1], truth), fit_rmse(track, truth)
-    return {"l": landmarks, "limit": float(np.hypot(landmarks, fit))}
+def landmark_limit(track: Track, settings: SimulationSettings, seed: int) -> list[dict[str, Any]]:
+    """Return the row of a simulated drive: the rmse (m) of the landmark batch that is told all."""
+    log = simulate(track, settings, seed)
+    return [{"track": track.name, "rmse": landmark_rmse(solve_oracle_landmarks(log)[1], truth_of(log))}]
 
 
 def solve_oracle_landmarks(log: Log) -> tuple[LandmarkSystem, LandmarkState]:
@@ -137,43 +130,7 @@ def landmark_rmse(solved: LandmarkState, truth: Truth) -> float:
     return root_mean_square(np.linalg.norm(errors[counted], axis=1))
 
 
-def fit_rmse(track: Map, truth: Truth) -> float:
-    """Return sqrt(mean d^2) in m, d from true cones to splines of the mapped size that are fitted to them.
-
-    Their knots follow the curvature (paper, section Simplification). A boundary of points, or with a control
-    point for every cone, has distances of 0. Boundaries that aren't mapped don't count.
-    """
-    distances = [np.zeros(0)]
-    for label, boundary in track.boundaries.items():
-        cones = accuracy.driving_order(truth, label)
-        fitted = cones
-        if isinstance(boundary, SplineBoundary) and boundary.size < len(cones):
-            like = boundary.spline
-            spline = fit_spline(cones, boundary.size, like.periodic, like.degree)
-            fitted = closest_points(spline, cones).position
-        distances.append(np.linalg.norm(cones - fitted, axis=1))
-    return root_mean_square(np.concatenate(distances))
-
-
 def truth_of(log: Log) -> Truth:
     if log.truth is None:
         raise ValueError("expected a log with truth, found one without")
     return log.truth
-
-
-@dataclass(frozen=True)
-class Gap:
-    """Distance of one run from another."""
-
-    curves: dict[str, float]  # two-way distance (m) of each boundary that both have mapped
-    along: float  # rms error along (m), in the frames of the reference
-    across: float  # (m)
-    heading: float  # (rad)
-
-
-def gap(run: RunResult, reference: RunResult) -> Gap:
-    shared = sorted(set(run.map.boundaries) & set(reference.map.boundaries))
-    own, others = run.map.boundaries, reference.map.boundaries
-    curves = {NAMES[label]: accuracy.two_way_distance(own[label], others[label]) for label in shared}
-    errors = pose_errors(run.trajectory_t, run.trajectory, reference.trajectory_t, reference.trajectory)
-    return Gap(curves, *(root_mean_square(column) for column in errors.T))

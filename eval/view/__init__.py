@@ -1,1 +1,1 @@
-"""What shows a run while it goes on: a recording for the live viewer, and a film."""
+"""What shows a run while it goes on: a recording for the live viewer."""

@@ -1,4 +1,4 @@
-"""A recording for the live viewer rerun, as a file or in a window, and all that watches a run."""
+"""A recording for the live viewer rerun, as a file or in a window."""
 
 import os
 import socket
@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
@@ -19,14 +19,12 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import CONDITIONS, LOST, Health
 from pathspace_graph.io.files import atomic_file, check_file_target
-from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BIG_ORANGE, BOUNDARIES, NAMES
 from pathspace_graph.labels import ORANGE as ORANGE_CONE
-from pathspace_graph.run import ObservedCycle, Observer
-from pathspace_graph.settings.output import FilmSettings, RecordingSettings
-
-from .animation import Animation, check_film_file, film, lap_seconds
+from pathspace_graph.run import ObservedCycle
+from pathspace_graph.settings.output import RecordingSettings
 
 SUFFIX: Final = ".rrd"
 DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")  # one is set with a display, on Linux
@@ -243,7 +241,7 @@ class Recorder:
     def _band(self, boundary: MapBoundary) -> list[Array]:
         if isinstance(boundary, SplineBoundary):
             u = style.curve_parameters(boundary.spline, self._settings.samples_per_span)
-            return list(style.uncertainty_band(boundary, u, widest=5.0))
+            return list(style.uncertainty_band(boundary, u))
         return list(style.ellipse_outlines(boundary.points, boundary.covariance))
 
     def _show_vehicle(self, cycle: ObservedCycle) -> None:
@@ -310,49 +308,3 @@ def pale(color: str) -> str:
 
 def _rgb(color: str) -> tuple[int, ...]:
     return tuple(bytes.fromhex(color.removeprefix("#")))
-
-
-class Watched(Protocol):
-    """Options of a command by which a run is watched."""
-
-    @property
-    def estimator(self) -> str: ...
-    @property
-    def view(self) -> bool: ...
-    @property
-    def save_view(self) -> Path | None: ...
-    @property
-    def animate(self) -> Path | None: ...
-    @property
-    def recording(self) -> RecordingSettings: ...
-    @property
-    def film(self) -> FilmSettings: ...
-
-
-def check_watchers(options: Watched) -> None:
-    """Raise where a run could not be watched so, before anything is mapped."""
-    check_recording(options.save_view, options.view)
-    if options.animate is not None:
-        check_film_file(options.animate)
-
-
-@contextmanager
-def watchers(options: Watched, log: Log) -> Iterator[list[Observer]]:
-    """Yield the observers that were asked for; their files are written at the end, or on failure none."""
-    observers: list[Observer] = []
-    with ExitStack() as stack:
-        if options.view or options.save_view is not None:
-            how: dict[str, Any] = {"settings": options.recording, "truth": log.truth}
-            observers.append(stack.enter_context(recording(options.save_view, window=options.view, **how)))
-        animation = None
-        if options.animate is not None:
-            if not log.cycles:
-                raise SettingsError("--animate: expected a log with perception cycles, found none")
-            reel = stack.enter_context(film(options.animate, options.film.frames_per_second))
-            track = log.source.get("track", "")
-            title = f"Mapped online by {options.estimator}" + (f", track: {track}" if track else "")
-            animation = Animation(reel, lap_seconds(log), options.film, log.truth, title)
-            observers.append(animation)
-        yield observers
-        if animation is not None:
-            animation.finish()

@@ -21,7 +21,6 @@ from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
-from pathspace_graph.eval.metrics.reference import gap
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.health import DEGRADED, LOST, counts
@@ -57,11 +56,18 @@ def online_command(options: Online) -> Outcome:
         plotting().check_picture(options.plot)
     viewing = viewers(options)
     if viewing is not None:
-        viewing.check_watchers(options)
+        viewing.check_recording(options.save_view, options.view)
     log, hints = read_plausible_log(options.log, options.settings.limits)
     tell(hints)
     log, estimator = begin(options, log, parameters) if known is None else begin_on(options, known, log)
-    with nullcontext([]) if viewing is None else viewing.watchers(options, log) as observers:
+    with (
+        nullcontext()
+        if viewing is None
+        else viewing.recording(
+            options.save_view, window=options.view, settings=options.recording, truth=log.truth
+        ) as recorder
+    ):
+        observers = [] if recorder is None else [recorder]
         mapped = map_online(log, estimator, options.estimator, observers)
         result = of_kind(with_own(mapped, parameters), options.map, options.settings)
         differ = [] if known is None else known.differences(result, estimator)
@@ -78,7 +84,7 @@ def online_command(options: Online) -> Outcome:
     wrong = [f"not a map of the drive: {crossed}"] if crossed else []
     if known is not None and known.found_at(estimator) is None:
         wrong.append(f"the vehicle was not found on {options.on}: this is the map of its own road")
-    files = (options.out, options.save, options.plot, options.save_view, options.animate)
+    files = (options.out, options.save, options.plot, options.save_view)
     return Outcome([file for file in files if file is not None], summarized, wrong)
 
 
@@ -88,8 +94,8 @@ def plotting() -> Any:
 
 
 def viewers(options: Online) -> Any:
-    """Import the module of viewers and films if one is requested, which draws as well."""
-    asked = options.view or options.save_view is not None or options.animate is not None
+    """Import the module of the viewer if it is requested."""
+    asked = options.view or options.save_view is not None
     return import_module("pathspace_graph.eval.view.recording") if asked else None
 
 
@@ -266,14 +272,13 @@ def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
 
 
 def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
-    """Summary of a run, how its optimization began and ended, and its gap from an online start."""
+    """Summary of a run, and how its optimization began and ended."""
     start = "odometry" if isinstance(result, BatchResult) and result.online is None else "online"
     summary = summarize(result, log, hints) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
         return summary
-    of_start = None if result.online is None else asdict(gap(result.online, result))
     summary |= {"convergence": asdict(result.convergence), "objection": result.objection}
-    return summary | {"stages": result.seconds, "gap": of_start}
+    return summary | {"stages": result.seconds}
 
 
 def tell(hints: Sequence[Hint], of: str = "") -> None:

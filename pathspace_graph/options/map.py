@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pathspace_graph.settings.checked import Checked
 from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
 from pathspace_graph.settings.mapper import MapperSettings, Start
-from pathspace_graph.settings.output import FilmSettings, RecordingSettings, SpeedSettings
+from pathspace_graph.settings.output import RecordingSettings, SpeedSettings
 
 from .parse import INLINE, NO_OPTION, PLACE
 
@@ -81,10 +81,7 @@ class Online(Checked, Estimation, group=""):
     """Show the run in the live viewer rerun."""
     save_view: Path | None = None
     """File (.rrd) for what the viewer shows; an earlier one is kept as a numbered backup."""
-    animate: Path | None = None
-    """File for a film (.gif, or .mp4 if ffmpeg is installed); an earlier one is kept as a numbered backup."""
     recording: RecordingSettings = field(default_factory=RecordingSettings)
-    film: FilmSettings = field(default_factory=FilmSettings)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
-from pathspace_graph.settings.evaluation import GhostSettings, ScalingSettings
+from pathspace_graph.settings.evaluation import ScalingSettings
 
 from .map import Estimation
 from .parse import PLACE
@@ -20,10 +20,9 @@ class Compare(Estimation):
     Of logs, tables, figures and all maps are written; of two maps, their distances and a picture.
 
     The paper's table is printed, or without truth what can be said without it; files have all metrics.
-    For several logs the tables have means, and differences from the reference, paired over the logs, with
-    their 95 % confidence interval. An estimator that fails is reported and does not stop the others; the exit
-    code is 3 then. Finished runs are kept in `OUT.unfinished` until all are there, so that the same command
-    resumes after it was killed.
+    For several logs the tables have means. An estimator that fails is reported and does not stop the others;
+    the exit code is 3 then. Finished runs are kept in `OUT.unfinished` until all are there, so that the same
+    command resumes after it was killed.
     """
 
     log: tuple[Path, ...] = field(metadata=PLACE)
@@ -32,12 +31,8 @@ class Compare(Estimation):
     """Folder for tables, figures and maps; an earlier comparison there is kept as a numbered backup."""
     estimators: tuple[str, ...] = field(default=(), metadata={"words": EVERY})
     """Names of the estimators, online and batch ones; by default all."""
-    reference: str | None = field(default=None, metadata={"words": EVERY})
-    """Estimator that the others are compared with: fixed-lag where it runs, otherwise the first."""
     jobs: int = 1
     """Number of runs at a time, -1 for one on each core; times of updates are comparable with 1 only."""
-    ghosts: GhostSettings = field(default_factory=GhostSettings)
-    """Definition of a ghost."""
 
 
 @dataclass(frozen=True, kw_only=True)

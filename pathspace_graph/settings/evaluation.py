@@ -1,19 +1,10 @@
-"""Settings of the evaluation: definition of a ghost, and extent of the timing."""
+"""Settings of the evaluation: extent of the timing."""
 
 from dataclasses import dataclass
 
 from pathspace_graph.errors import SettingsError
 
 from .checked import Checked
-
-
-@dataclass(frozen=True)
-class GhostSettings(Checked):
-    """Definition of a ghost."""
-
-    distance: float = 2.0
-    """Distance from the true boundary of its own colour beyond which a mapped point is a ghost (m). The
-    default exceeds the drift of a map whose loop is closed, but not the width of the narrowest lane (3 m)."""
 
 
 @dataclass(frozen=True)

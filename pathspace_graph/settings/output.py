@@ -1,4 +1,4 @@
-"""Settings of a speed profile, a recording for the live viewer, and a film."""
+"""Settings of a speed profile and a recording for the live viewer."""
 
 from dataclasses import dataclass
 
@@ -28,21 +28,3 @@ class RecordingSettings(Checked):
     replaced, it has one too. The curves are shown in every cycle."""
     samples_per_span: int = 6
     """Lines in each span of a curve."""
-
-
-@dataclass(frozen=True)
-class FilmSettings(Checked):
-    """The film of a run."""
-
-    seconds_per_lap: float = 10.0
-    """Time of film for a lap, s."""
-    frames_per_second: float = 12.5
-    """Frames in a second; a frame of a .gif begins at a multiple of 0.01 s."""
-    width: int = 780
-    """Width of a frame, pixels."""
-    height: int = 520
-    """Height of a frame, pixels."""
-    laps: Unlimited = float("inf")
-    """Laps after which the film ends; the mapping continues."""
-    hold: float = 2.0
-    """Time for which the last frame is shown, s."""

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pandas as pd
 import pytest
 
-from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.hints import CAUSES, GOOD, HintStudy, causes_of, judged
+from pathspace_graph.eval.hints import (
+    AS_SIMULATED,
+    CAUSES,
+    GOOD,
+    causes_of,
+    hints_table,
+    judge,
+    judged,
+    parts_of,
+)
 from pathspace_graph.io.overrides import leaves, override
 from pathspace_graph.sim.mistakes import MISTAKES
 from pathspace_graph.sim.simulate import SimulationSettings
@@ -35,15 +41,20 @@ def test_a_wrong_cause_does_not_count() -> None:
     assert (wrong["accused"], wrong["named"]) == (True, False)
 
 
-def test_each_good_log_is_judged_and_spoiled_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(f"{HintStudy.__module__}.GOOD", {"as simulated": GOOD["as simulated"]})
-    study = HintStudy(tracks=(0,), seeds=(0,), mistakes=("y to the right",))
-    frame, told = study.measure(folder=tmp_path), list[tuple[int, int]]()
-    assert frame["kind"].tolist() == ["good", "spoiled"]
-    assert frame["of"].tolist() == ["as simulated"] * 2
-    assert frame["named"].tolist() == [False, True]
-    again = study.measure(folder=tmp_path, on_cell=lambda *steps: told.append(steps))
-    assert told == [(0, 0)], "what was judged is kept"
-    pd.testing.assert_frame_equal(again, frame)
-    with pytest.raises(SettingsError, match="mistakes: expected a known one, found 'y to the left'"):
-        HintStudy(mistakes=("y to the left",)).measure()
+def test_a_good_log_is_judged_and_spoiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "pathspace_graph.eval.hints.GOOD", {AS_SIMULATED: GOOD[AS_SIMULATED], "backs up": None}
+    )
+    (arguments, other) = parts_of((0,), ("y to the right",))
+    assert (arguments["mistakes"], other["mistakes"]) == (("y to the right",), ())
+    rows = judge(**arguments)
+    assert [(row["kind"], row["accused"], row["named"]) for row in rows] == [
+        ("good", False, False),
+        ("spoiled", True, True),
+    ]
+    table = hints_table(pd.DataFrame(rows)).records()
+    assert [tuple(row.values()) for row in table] == [
+        ("y to the right", "1", "1"),
+        ("all mistakes", "1", "1"),
+        ("good logs, accused of any", "0", "1"),
+    ]

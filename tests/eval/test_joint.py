@@ -5,7 +5,8 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from pathspace_graph.eval.joint import JointStudy, joint_table, metrics_of_group
+from pathspace_graph.eval.joint import joint_table, metrics_of_group, of_track
+from pathspace_graph.sim.simulate import SimulationSettings
 
 from ..batch.joint.several import alone, lap
 
@@ -37,18 +38,11 @@ def test_the_table_compares_each_number_with_half_of_it_track_by_track() -> None
     assert together["within 2σ [%]"].startswith("95.0 ±")
 
 
-def test_a_study_has_a_row_for_each_map(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_there_is_a_row_for_each_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of four drives there are four maps of one, two of two, and one of all."""
-    found: list[tuple[str, ...]] = []
-
-    def metrics(logs: dict[str, object], results: dict[str, object]) -> dict[str, object]:
-        assert set(logs) <= set(results)
-        found.append(tuple(logs))
-        return {}
-
-    monkeypatch.setattr("pathspace_graph.eval.joint.metrics_of_group", metrics)
+    monkeypatch.setattr("pathspace_graph.eval.joint.metrics_of_group", lambda logs, _: {"logs": [*logs]})
     monkeypatch.setattr("pathspace_graph.eval.joint.solve_alone", lambda log: log)
     monkeypatch.setattr("pathspace_graph.eval.joint.simulate", lambda track, settings, seed: seed)
-    frame = JointStudy(tracks=(4,), drives=4, cars={"plain": None}).measure()  # type: ignore[dict-item]
-    assert frame["drives"].tolist() == [1, 1, 1, 1, 2, 2, 4]
-    assert found[4:] == [("0", "1"), ("2", "3"), ("0", "1", "2", "3")]
+    rows = of_track("plain", 4, SimulationSettings(), 4)
+    assert [row["drives"] for row in rows] == [1, 1, 1, 1, 2, 2, 4]
+    assert [row["logs"] for row in rows[4:]] == [["0", "1"], ["2", "3"], ["0", "1", "2", "3"]]

@@ -6,13 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pathspace_graph.eval.known import (
-    KINDS,
-    begun_later,
-    drive_on,
-    known_table,
-    surveyed,
-)
+from pathspace_graph.eval.known import OTHER, OWN, begun_later, drive_on, known_table, surveyed
 from pathspace_graph.eval.metrics.reference import truth_of
 from pathspace_graph.eval.metrics.registration import motion_onto
 from pathspace_graph.factors.se2 import compose, move_points
@@ -66,12 +60,12 @@ def test_the_table_has_a_row_for_each_kind_of_map_over_tracks() -> None:
     rest = {"car": "plain", "soon": 1.0, "wrong": 0.0, "map": 0.1}
     rows = [
         {**rest, "track": track, "kind": kind, "found": found, "error": error}
-        for kind in KINDS
+        for kind in (OWN, OTHER)
         for track, found, error in ((0, 1.0, 0.1), (0, 0.0, np.nan), (1, 1.0, 0.3))
     ]
     table = known_table(pd.DataFrame(rows))
     assert table.header[0] == "cars, known map"
     every = table.records()
-    assert [row["cars, known map"] for row in every] == [f"plain, {kind} (3 drives)" for kind in KINDS]
+    assert [row["cars, known map"] for row in every] == [f"plain, {kind} (3 drives)" for kind in (OWN, OTHER)]
     assert every[0]["found [%]"].startswith("75 ±")  # not two thirds: each track counts once
     assert every[0]["pose error [m]"].startswith("0.20 ±")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pathspace_graph.cli import main
-from pathspace_graph.eval.real import map_real_log, maps_table, measured_table, runs_table
+from pathspace_graph.eval.real import map_real_logs, maps_table, measured_table, runs_table
 
 from ..convert.recorded import camera_drive, write_recorded
 
@@ -13,12 +13,13 @@ CONVERT = ["--from", "csv", "--columns", "label=colour", "--labels", "left=1", "
 
 
 def test_real_logs_are_mapped_and_held_against_each_other(tmp_path: Path) -> None:
-    drives = []
     for name in ("first", "second"):
         recorded = write_recorded(camera_drive(), tmp_path / "recorded" / name)
         assert main(["-q", "convert", str(recorded), *CONVERT, "--out", str(tmp_path / name)]) == 0
-        drives.append(map_real_log(tmp_path / name, tmp_path / "out"))
-    assert (tmp_path / "out" / "second" / "batch" / "map.json").exists()
+    logs, cells = [tmp_path / name for name in ("first", "second")], list[int]()
+    map_real_logs(logs, tmp_path / "out")
+    drives = map_real_logs(logs, tmp_path / "out", on_cell=lambda _, remaining: cells.append(remaining))
+    assert cells == [0], "what was mapped is kept"
     online = runs_table(drives).records()[0]
     assert online["log, run"] == "first, online"
     assert online["closed [%]"] == "100" and online["lost [%]"] == "0.0"

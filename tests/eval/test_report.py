@@ -105,8 +105,8 @@ def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
 
 
 def test_the_table_of_the_camera_ends_with_the_limit_of_landmarks() -> None:
-    more = {"nees": 1.5, "l": 0.2, "reported_degraded": 0.25, "map_scale_nees": 0.8}
-    found = camera_table(BOTH.assign(**more), CAMERA)
+    more = {"nees": 1.5, "reported_degraded": 0.25, "map_scale_nees": 0.8}
+    found = camera_table(BOTH.assign(**more), pd.DataFrame({"track": ["t", "t"], "rmse": [0.1, 0.3]}), CAMERA)
     assert found.header[:3] == ("estimator", "rmse [m]", "rmse without turn and scale [m]")
     assert labels(found) == ["fixed-lag", "spline", "landmarks, given all"]
     assert [values(found, row)[0] for row in range(3)] == pytest.approx([0.2, 0.1, 0.2])

@@ -50,7 +50,7 @@ def test_a_small_measurement_end_to_end(tmp_path: Path) -> None:
     assert content["seconds_compared"] == {"fixed-lag": None}  # 200 cones weren't reached
     assert {s["sweep"] for s in content["slopes"]} == {CONES, READINGS, LAPS, DENSE_LINE}
     assert len(pd.read_csv(tmp_path / "out" / "points.csv")) == len(scaling.points)
-    names = {"scaling.png", "laps.png", "table.md"}
+    names = {"scaling.png", "table.md"}
     assert names <= {file.name for file in (tmp_path / "out").iterdir()}
     assert scaling_table(scaling).rows[0][0] == "fixed-lag"
 

@@ -8,28 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.experiment.compare import (
     Comparison,
     compare,
     final_table,
-    paired_frame,
     paper_frame,
     paper_table,
     plan_of,
     side_by_side,
     tables,
 )
-from pathspace_graph.eval.experiment.plots import Drawn, find_blind_spot, plot_maps
+from pathspace_graph.eval.experiment.plots import Drawn, plot_maps
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
-from pathspace_graph.io.log import Truth, read_log, write_log
-from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
-from pathspace_graph.labels import LEFT
+from pathspace_graph.io.log import read_log, write_log
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.bspline import BSpline
 
-from ...scenes.rings import CENTRE, Gaps, Rings, register, write_logs
+from ...scenes.rings import Gaps, Rings, register, write_logs
 
 pytestmark = pytest.mark.usefixtures("png_only")
 
@@ -49,7 +44,7 @@ def compared(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Comparis
     """Two estimators on both logs."""
     with pytest.MonkeyPatch.context() as patch:
         register(patch)
-        return compare(plan_of(folder, ("rings", "gaps"), "gaps"), tmp_path_factory.mktemp("cells"))
+        return compare(plan_of(folder, ("rings", "gaps")), tmp_path_factory.mktemp("cells"))
 
 
 # --- choice ----------------------------------------------------------------------------------------------
@@ -60,15 +55,9 @@ def test_estimators_are_those_named_or_all_that_are_known(
 ) -> None:
     found = plan_of(folder / "a").study
     assert found.estimators == ("rings", "gaps", "broken", "rings-batch")
-    assert found.baseline.estimator == "rings"
     assert plan_of(folder, ("gaps", "rings", "gaps")).study.estimators == ("gaps", "rings")
     with pytest.raises(SettingsError, match=r"a known estimator, found 'nothing'$"):
         plan_of(folder, ("nothing",))
-    with pytest.raises(SettingsError, match="--reference"):
-        plan_of(folder, ("gaps",), "rings")
-    monkeypatch.setitem(registry.ONLINE, registry.DEFAULT_ONLINE, Gaps)  # type: ignore[misc]
-    both = plan_of(folder, ("gaps", registry.DEFAULT_ONLINE)).study
-    assert both.baseline.estimator == registry.DEFAULT_ONLINE
 
 
 def test_logs_of_a_folder(folder: Path, tmp_path: Path) -> None:
@@ -142,13 +131,6 @@ def test_the_paper_s_table_is_the_mean_over_logs(compared: Comparison) -> None:
     assert [str(cell) for cell in cells] == ["0.100 ± 0.000", "0.0 ± 0.0", "32 ± 0"]
 
 
-def test_differences_are_paired_over_logs(compared: Comparison) -> None:
-    found = paired_frame(compared)
-    size = found[found["metric"] == "size"].iloc[0]
-    assert (size["estimator"], size["reference"], size["pairs"]) == ("rings", "gaps", 2)
-    assert (size["mean"], size["low"], size["high"]) == (-4.0, -4.0, -4.0)
-
-
 def test_without_truth_only_what_needs_none_is_told(folder: Path, tmp_path: Path) -> None:
     write_log(replace(read_log(folder / "a"), truth=None), tmp_path / "bare")
     found = compare(plan_of(tmp_path / "bare", ("rings",)), tmp_path / "cells")
@@ -161,36 +143,6 @@ def test_without_truth_only_what_needs_none_is_told(folder: Path, tmp_path: Path
     ]
     assert table.records()[0] == {"metric": "size", "rings": "32"}
     assert {row[0] for row in final_table(found).rows} >= {"size", "map [kB]", "update, mean [ms]"}
-
-
-# --- blind spot ------------------------------------------------------------------------------------------
-
-
-def test_the_blind_spot_is_where_most_cones_are_missed_on_end(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("pathspace_graph.eval.experiment.plots.HALF_SIZE", np.array([6.0, 5.0]))
-    truth = read_log(folder / "a").truth
-    assert truth is not None
-    settings, log = MapperSettings(), read_log(folder / "a")
-    spot = find_blind_spot(truth, Rings(settings, log).map(), Gaps(settings, log).map())
-    assert spot is not None
-    angle = 2 * np.pi * np.array([3, 4, 5]) / 20
-    expected = CENTRE + 12.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    assert [len(missed) for missed in spot.missed] == [0, 3]
-    np.testing.assert_allclose(np.sort(spot.missed[1], axis=0), np.sort(expected, axis=0), atol=1e-3)
-    assert find_blind_spot(truth, Rings(settings, log).map(), Rings(settings, log).map()) is None
-
-
-def test_a_blind_spot_needs_a_spline_that_passes_there() -> None:
-    cones = np.array([[0.0, 0.0], [20.0, 0.0]])
-    truth = Truth(np.zeros(0), np.zeros((0, 3)), cones, np.array([LEFT, LEFT]))
-    line = BSpline.clamped_from(np.array([0.0, 5.0]), np.column_stack([np.linspace(0, 5, 4), np.zeros(4)]))
-    spline = Map(False, {LEFT: SplineBoundary(line, np.zeros((8, 8)))})
-    nothing = Map(False, {LEFT: PointBoundary(np.array([[50.0, 0.0]]), np.eye(2))})
-    spot = find_blind_spot(truth, spline, nothing)
-    assert spot is not None
-    np.testing.assert_array_equal(spot.centre, [0.0, 0.0])
 
 
 # --- tables and figures ----------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Outcomes of faults, and their table and figure, from a frame that is known by hand."""
+"""Outcomes of faults, and their table, from a frame that is known by hand."""
 
 from __future__ import annotations
 
@@ -14,13 +14,10 @@ from pathspace_graph.eval.experiment.faults import (
     beside_clean,
     fault_table,
     outcomes,
-    plot_faults,
     with_notices,
     write_suite,
 )
 from pathspace_graph.eval.experiment.study import Study
-
-pytestmark = pytest.mark.usefixtures("png_only")
 
 NOISE = {
     "clean": {},
@@ -108,27 +105,6 @@ def test_the_table_has_the_cost_of_each_fault_and_what_was_said(frame: pd.DataFr
     assert mild["calibration by its prior's sigma"] == "scale error of the speeds -4.0"
 
 
-def test_the_figure_has_a_panel_for_each_fault_and_a_look_for_each_fate(frame: pd.DataFrame) -> None:
-    figure = plot_faults(STUDY, beside_clean(frame))
-    visible = [axes for axes in figure.axes if axes.get_visible()]
-    assert [axes.get_title(loc="left") for axes in visible] == ["latency [ms]"]
-    labels = {str(line.get_label()) for line in visible[0].lines}
-    assert {"no map", "lost at the end", "not lost, reported", "mean"} <= labels
-    assert [text.get_text() for text in visible[0].get_xticklabels()] == ["20", "50"]
-
-
-def test_runs_without_a_map_are_crosses_on_the_upper_edge(frame: pd.DataFrame) -> None:
-    frame["rmse"] = np.nan
-    figure = plot_faults(STUDY, beside_clean(frame))
-    figure.draw_without_rendering()
-    (axes,) = [axes for axes in figure.axes if axes.get_visible()]
-    crosses = [line for line in axes.lines if line.get_label() == "no map"]
-    places = np.concatenate([line.get_xydata() for line in crosses])
-    np.testing.assert_allclose(places, [[-0.15, 0.95], [0.15, 0.95], [1.0, 0.95]])
-    assert all(line.get_transform() == axes.get_xaxis_transform() for line in crosses)
-    assert {line.get_label() for line in axes.lines}.isdisjoint({"mean", "not lost", "lost at the end"})
-
-
 def test_the_files_hold_every_value(frame: pd.DataFrame, tmp_path: Path) -> None:
     frame["ms_mean"] = 1.0
     text = write_suite(STUDY, frame, tmp_path)
@@ -147,7 +123,7 @@ def test_the_files_hold_every_value(frame: pd.DataFrame, tmp_path: Path) -> None
         np.testing.assert_allclose(flat[name], [row[name] for row in expected], err_msg=name)
     assert json.loads(flat["notices"][1]) == {"a notice": 1}
     written = {file.name for file in tmp_path.iterdir()}
-    forms = {f"faults.{suffix}" for suffix in ("txt", "md", "tex", "csv", "json", "png")}
+    forms = {f"faults.{suffix}" for suffix in ("txt", "md", "tex", "csv", "json")}
     assert written == forms | {"results.csv", "times.csv"}
 
 

@@ -18,10 +18,10 @@ from ...scenes.paths import ROOT
 @pytest.mark.parametrize(
     ("noise", "fault"),
     [
-        ("latency: 20 ms", Fault("latency", "20 ms", 20.0, "ms")),
-        ("false positives a cycle: 0.5", Fault("false positives a cycle", "0.5", 0.5, "")),
-        ("yaw-rate bias: 0.01 rad/s", Fault("yaw-rate bias", "0.01 rad/s", 0.01, "rad/s")),
-        (CLEAN, Fault(CLEAN, "", 0.0, "")),
+        ("latency: 20 ms", Fault("latency", 20.0, "ms")),
+        ("false positives a cycle: 0.5", Fault("false positives a cycle", 0.5, "")),
+        ("yaw-rate bias: 0.01 rad/s", Fault("yaw-rate bias", 0.01, "rad/s")),
+        (CLEAN, Fault(CLEAN, 0.0, "")),
     ],
 )
 def test_a_noise_says_the_fault_and_its_strength(noise: str, fault: Fault) -> None:

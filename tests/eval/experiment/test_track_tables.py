@@ -1,17 +1,14 @@
-"""The table by track: the laps of a column, means over seeds, failures, and what stands below the tracks."""
+"""The table by track: means over seeds and failures; and the forms of any table."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.eval.experiment.tables import Table, track_tables
-from pathspace_graph.eval.metrics.metric import METRICS, column_of
+from pathspace_graph.eval.metrics.metric import METRICS
 
 RUNS = {  # rmse (m) of laps 1, 2 and 3
     ("oval", 0): (0.6, 0.2, 0.1),
@@ -39,89 +36,43 @@ def frame(failed: tuple[str, int] | None = None, variant: str = "default") -> pd
     return pd.DataFrame(rows).astype({"lap": "Int64"})
 
 
-def table(*columns: str, of: pd.DataFrame | None = None) -> dict[str, tuple[Any, ...]]:
+def table(of: pd.DataFrame, metric: str = "rmse") -> dict[str, tuple[str, ...]]:
     """The one table's rows by their name."""
-    (found,) = track_tables(Study(tracks=(0,), columns=columns), frame() if of is None else of)
-    assert found.header[:2] == ("track", "runs")
-    return {str(row[0]): row[1:] for row in found.rows}
+    (found,) = track_tables(Study(tracks=(0,), metrics=(metric,)), of)
+    assert found.header == ("track", "runs", METRICS[metric].heading)
+    return {str(row[0]): tuple(map(str, row[1:])) for row in found.rows}
 
 
-def test_a_column_is_of_the_last_lap_of_one_of_the_later_ones_or_of_all() -> None:
-    found = table("rmse", "rmse@1", "rmse@later", "rmse@all")
-    assert found["bean"] == ("1 of 1", "0.500", "0.200", "0.350", "0.300")
-    assert found["oval"] == ("2 of 2", "0.200", "0.700", "0.250", "0.400")  # means over two seeds
-
-
-def test_below_the_tracks_every_run_counts_the_same() -> None:
-    found = table("rmse")
-    assert list(found) == ["oval", "bean", "all, mean", "all, median", "all, largest"]
-    assert found["all, mean"] == ("3 of 3", "0.300")
-    assert found["all, median"] == ("3 of 3", "0.300")
-    assert found["all, largest"] == ("3 of 3", "0.500")
+def test_a_track_has_the_mean_of_its_last_laps_and_every_run_counts_the_same_in_all() -> None:
+    assert table(frame()) == {
+        "oval": ("2 of 2", "0.200"),
+        "bean": ("1 of 1", "0.500"),
+        "all": ("3 of 3", "0.300"),
+    }
 
 
 def test_a_failed_run_is_counted_and_has_no_value() -> None:
-    found = table("rmse@1", of=frame(failed=("oval", 1)))
-    assert found["oval"] == ("1 of 2", "0.600")
-    assert table("rmse", of=frame(failed=("bean", 0)))["bean"] == ("0 of 1", "–")
+    assert table(frame(failed=("oval", 1)))["oval"] == ("1 of 2", "0.100")
+    assert table(frame(failed=("bean", 0)))["bean"] == ("0 of 1", "–")
 
 
 def test_a_last_lap_without_a_value_is_not_that_of_the_lap_before() -> None:
     runs = frame()
     runs.loc[(runs["track"] == "bean") & (runs["lap"] == 3), "rmse"] = float("nan")
-    assert table("rmse", of=runs)["bean"] == ("1 of 1", "–")
-
-
-def test_a_metric_that_was_not_measured_is_a_dash() -> None:
-    assert table("limit")["oval"] == ("2 of 2", "–")
+    assert table(runs)["bean"] == ("1 of 1", "–")
 
 
 def test_every_combination_has_a_table_of_its_own() -> None:
     both = pd.concat([frame(), frame(variant="lag=1")])
-    study = Study(tracks=(0,), columns=("rmse",), grids=({"lag": [1.0]},))
+    study = Study(tracks=(0,), grids=({"lag": [1.0]},))
     assert [found.title for found in track_tables(study, both)] == ["default", "lag=1"]
-    assert track_tables(Study(tracks=(0,)), both) == []
 
 
-def test_errors_with_a_sign_have_root_mean_squares_and_magnitudes() -> None:
+def test_errors_with_a_sign_have_root_mean_squares() -> None:
     turned = frame().rename(columns={"rmse": "turn"})
     turned.loc[turned["track"] == "oval", "turn"] *= -1.0
-    factor = METRICS["turn"].factor
-    found = {name: float(cells[1]) / factor for name, cells in table("turn", of=turned).items()}
-    assert found["oval"] == pytest.approx(np.sqrt((0.1**2 + 0.3**2) / 2), abs=1e-3)
-    assert found["all, mean"] == pytest.approx(np.sqrt((0.1**2 + 0.3**2 + 0.5**2) / 3), abs=1e-3)
-    assert (found["all, median"], found["all, largest"]) == (
-        pytest.approx(0.3, abs=1e-3),
-        pytest.approx(0.5, abs=1e-3),
-    )
-
-
-def test_a_slope_is_of_all_runs_together() -> None:
-    runs = frame().assign(bias_true=[0.1, 0.1, 0.1, 0.3, 0.3, 0.3, -0.5, -0.5, -0.5])
-    found = table("slope(rmse, bias_true)", of=runs)
-    assert found["oval"] == ("2 of 2", "1.00")  # 0.1 on 0.1 and 0.3 on 0.3
-    assert found["all, mean"] == ("3 of 3", f"{(0.1**2 + 0.3**2 - 0.5**2) / 0.35:.2f}")
-    assert found["all, median"] == ("3 of 3", "–")
-    assert (
-        column_of("slope(bias, bias_true)").title
-        == "slope of bias of the yaw rate on bias of the yaw rate, true"
-    )
-    with pytest.raises(SettingsError, match="columns: expected"):
-        column_of("slope(bias, bais)")
-
-
-@pytest.mark.parametrize("column", ["rmsee", "rmse@", "rmse@0.5", "rmse@last"])
-def test_an_unknown_column_is_refused(column: str) -> None:
-    if column == "rmse@":
-        assert column_of(column).laps == ""
-        return
-    with pytest.raises(SettingsError, match="columns: expected"):
-        Study(tracks=(0,), columns=(column,))
-
-
-def test_yardsticks_are_true_or_false() -> None:
-    with pytest.raises(SettingsError, match="reference_limits: expected true or false, found 1"):
-        Study(tracks=(0,), reference_limits=1)  # type: ignore[arg-type]
+    expected = METRICS["turn"].factor * np.sqrt((0.1**2 + 0.3**2) / 2)
+    assert float(table(turned, "turn")["oval"][1]) == pytest.approx(expected, abs=0.005)
 
 
 def test_a_table_keeps_its_units_and_escapes_what_latex_would_take_for_commands() -> None:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.metrics.accuracy import ghosts
 from pathspace_graph.io.map import Map
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.settings.evaluation import GhostSettings
 
 from .straight_maps import landmarks, line, row, truth
 
@@ -26,7 +24,6 @@ def test_ghost_landmarks() -> None:
     )
     found = ghosts(track, true)
     assert found == {"ghost_landmarks": 2, "ghost_metres": 0.0}
-    assert ghosts(track, true, GhostSettings(distance=3.0))["ghost_landmarks"] == 1
 
 
 def test_ghost_curve_is_the_length_with_no_boundary_near() -> None:
@@ -36,5 +33,3 @@ def test_ghost_curve_is_the_length_with_no_boundary_near() -> None:
     assert found["ghost_landmarks"] == 0
     whole = ghosts(Map(False, {LEFT: line(2.0)}), truth(np.zeros((0, 2))))
     assert whole["ghost_metres"] == pytest.approx(10.0)
-    with pytest.raises(SettingsError):
-        GhostSettings(distance=0.0)

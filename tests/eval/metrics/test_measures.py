@@ -106,15 +106,13 @@ def test_without_truth_only_what_needs_none_is_measured() -> None:
     assert set(measure(run(true), bare)[0].values) == keys | {"ate", "along", "across"}
 
 
-def test_marginals_are_measured_and_limits_need_associations() -> None:
+def test_marginals_are_measured() -> None:
     true = circle_truth()
     (*_, whole) = measure(run(true), log(true))
     for key in ("inside", "normalized_error"):  # the map's covariance has no cross terms
         assert whole.values[f"{key}_marginals"] == pytest.approx(whole.values[key])
     # 0.3 m by 0.1 m at both ends, and by 0.1 sqrt(20 / 64) m in the middle
     assert whole.values["normalized_error"] == pytest.approx((9.0 + 9.0 + 28.8) / 3)
-    with pytest.raises(ValueError, match="associations"):
-        measure(run(true), log(true), reference_limits=True)
 
 
 def test_landmarks_have_no_band() -> None:

@@ -1,4 +1,4 @@
-"""A short drive that is mapped once alone, and once with all that can watch it."""
+"""A short drive that is mapped once alone, and once with the recorder."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.view.animation import Animation, film, lap_seconds
 from pathspace_graph.eval.view.recording import recording
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, PointBoundary
@@ -16,12 +15,11 @@ from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import ORANGE
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import ObservedCycle, run_online
-from pathspace_graph.settings.output import FilmSettings, RecordingSettings
+from pathspace_graph.settings.output import RecordingSettings
 
 from ...scenes.drives import noisy_lap
 
 BAND_EVERY = 7
-FILM = FilmSettings(seconds_per_lap=1.0, frames_per_second=10.0, width=300, height=200, hold=0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +33,6 @@ class Watched:
     window: list[int]
     """(n,) Each cycle had this number of poses in the window."""
     rrd: Path
-    gif: Path
 
 
 @pytest.fixture(scope="session")
@@ -45,18 +42,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Watched:
     alone = run_online(log, FixedLagMapper(odometry_sigma=log.odometry_sigma))
     cycles: list[ObservedCycle] = []
     window: list[int] = []
-    rrd, gif = folder / "run.rrd", folder / "run.gif"
+    rrd = folder / "run.rrd"
     settings = RecordingSettings(band_every=BAND_EVERY)
-    with (
-        recording(rrd, settings=settings, truth=log.truth) as recorder,
-        film(gif, FILM.frames_per_second) as reel,
-    ):
-        animation = Animation(reel, lap_seconds(log), FILM, log.truth, "a bean")
+    with recording(rrd, settings=settings, truth=log.truth) as recorder:
         mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
-        look = [recorder, animation, cycles.append, lambda cycle: window.append(len(cycle.window))]
+        look = [recorder, cycles.append, lambda cycle: window.append(len(cycle.window))]
         watched = run_online(log, mapper, observers=look)
-        animation.finish()
-    return Watched(log, alone, watched, cycles, window, rrd, gif)
+    return Watched(log, alone, watched, cycles, window, rrd)
 
 
 class OrangeMapper(FixedLagMapper):

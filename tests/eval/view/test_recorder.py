@@ -1,4 +1,4 @@
-"""Recording and film of one run are read back and held against it, which they must not have changed."""
+"""The recording of a run is read back and compared with the run, which it must not have changed."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image, ImageSequence
 from rerun.chunk import RrdReader
 
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.view import recording as entities
-from pathspace_graph.eval.view.animation import lap_seconds
 from pathspace_graph.eval.view.recording import dashes, pale, recording
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
@@ -20,7 +18,7 @@ from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ...scenes.drives import ahead, corridor, exact_log
-from .conftest import BAND_EVERY, FILM, OrangeMapper, Watched
+from .conftest import BAND_EVERY, OrangeMapper, Watched
 
 Rows = dict[str, dict[int, dict[str, Any]]]
 
@@ -55,17 +53,6 @@ def test_watching_a_run_changes_nothing_to_the_bit(run: Watched) -> None:
         other = run.watched.map.boundaries[label]
         np.testing.assert_array_equal(other.spline.control_points, boundary.spline.control_points)
         np.testing.assert_array_equal(other.covariance, boundary.covariance)
-
-
-def test_a_lap_takes_the_time_of_film_that_was_asked_for(run: Watched) -> None:
-    with Image.open(run.gif) as gif:
-        durations = [frame.info["duration"] / 1e3 for frame in ImageSequence.Iterator(gif)]
-        assert gif.size == (FILM.width, FILM.height)
-    driven = run.log.cycles[-1].t - run.log.cycles[0].t
-    frames = 1 + int(driven / lap_seconds(run.log) * FILM.seconds_per_lap * FILM.frames_per_second)
-    assert len(durations) == frames
-    assert durations[-1] == pytest.approx(durations[0] + FILM.hold)  # the last one is held
-    assert sum(durations) == pytest.approx(frames / FILM.frames_per_second + FILM.hold)
 
 
 def test_every_cycle_has_its_figures(rows: Rows, run: Watched) -> None:
