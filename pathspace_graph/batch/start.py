@@ -66,7 +66,7 @@ class CurveMapper(OnlineEstimator, Protocol):
 
 def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
     """Run an online estimator; return its final map with all of its poses, and the run."""
-    run, state = run_online(log, mapper), State()
+    run, state = run_online(log, mapper, outlines=True), State()
     for label, known in mapper.boundaries.items():
         boundary = Boundary(known.knots, known.periodic, exact_settings(known.settings), known.gauge)
         boundary.confirmed_end = known.confirmed_end
