@@ -27,6 +27,7 @@ REGISTERED_SHRINK: Final = 0.7  # factor for each further iteration, down to `cl
 REGISTERED_ITERATIONS: Final = 7
 START_STEP: Final = 2.0  # distance of the poses of the beginning at which a lost vehicle is tried (m)
 START_CHI2: Final = 16.3  # largest squared Mahalanobis distance of these: 99.9 % of chi-square, 3 degrees
+RIVAL_APART: Final = 1.5  # least distance of two different places (m); gaps between cones are larger
 REGISTERED_DETECTIONS: Final = 25  # least number of registered detections
 MIN_INLIERS: Final = 5  # least number of inliers on each boundary
 
@@ -177,7 +178,7 @@ def start_crossings(path: Array, start: Array) -> tuple[BoolArray, Array]:
 def register(
     track: CurveMap, times: Sequence[float], covariance: Array, beginning: Array, settings: ClosingSettings
 ) -> RefinedMotion | None:
-    """Register the newest detections with the beginning of the curves; return None if they disagree.
+    """Register the newest detections with the beginning of the curves; None if they disagree or fit twice.
 
     Iterated closest points on the curves minimize `sum (n . (M p - S(u)))^2 / sigma^2 + m' P^-1 m`. The
     `covariance` P (3, 3) of the newest pose is the prior, since detections along a straight or an arc do not
@@ -187,16 +188,40 @@ def register(
     registration, state = _with_beginning(track, times, settings), track.state
     prior = np.asarray(np.linalg.inv(covariance * settings.prior_scale**2), np.float64)
     centre, vector, lost = state.poses[-1, :2].copy(), np.zeros(3), is_lost(covariance, settings)
+    _, first = np.unique(path_lengths(beginning) // START_STEP, return_index=True)
+    starts = beginning[first] - state.poses[-1]
+    starts[:, 2] = wrap_angle(starts[:, 2])
     if lost:
-        _, first = np.unique(path_lengths(beginning) // START_STEP, return_index=True)
-        motions = beginning[first] - state.poses[-1]
-        motions[:, 2] = wrap_angle(motions[:, 2])
-        starts = [vector, *(v for v in motions if v @ prior @ v < START_CHI2)]
-        inliers = [registration.match(Motion(centre, v), REGISTERED_REACH).inlier.sum() for v in starts]
-        vector = starts[int(np.argmax(inliers))]
+        likely = [vector, *_within(starts, prior)]
+        inliers = [registration.match(Motion(centre, v), REGISTERED_REACH).inlier.sum() for v in likely]
+        vector = likely[int(np.argmax(inliers))]
     found = registration.refine(Motion(centre, vector), np.zeros(3), prior)
-    agree = agrees(found.matches, list(state.boundaries), settings)
-    return found if agree and is_certain(found.matches, found.covariance, settings, lost) else None
+    if not agrees(found.matches, list(state.boundaries), settings):
+        return None
+    if not is_certain(found.matches, found.covariance, settings, lost):
+        return None
+    return None if _has_rival(registration, found, starts, prior) else found
+
+
+def _has_rival(registration: Registration, found: RefinedMotion, starts: Array, prior: Array) -> bool:
+    """Whether detections also agree with another place, refined from starts (k, 3) near the found one.
+
+    Cones at regular distances along a straight lie as well on the curves if they are moved by a gap. The
+    covariance of one optimum does not know of others.
+    """
+    motion, labels = found.motion, list(registration.state.boundaries)
+    for start in _within(starts - motion.vector, prior) + motion.vector:
+        other = registration.refine(Motion(motion.centre, start), np.zeros(3), prior)
+        apart = np.hypot(*(other.motion.vector - motion.vector)[:2])
+        if apart > RIVAL_APART and agrees(other.matches, labels, registration.settings):
+            return True
+    return False
+
+
+def _within(motions: Array, information: Array) -> Array:
+    """Select the motions (k, 3) that a prior with mean zero allows."""
+    chi2 = np.einsum("ki,ij,kj->k", motions, information, motions)
+    return np.asarray(motions[chi2 < START_CHI2])
 
 
 def is_within_reach(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> bool:
