@@ -11,7 +11,7 @@ T = TypeVar("T")
 def shallow(one: T) -> T:
     """Return an object with the same attributes, as `copy.copy` does in five times the time."""
     other = object.__new__(type(one))
-    vars(other).update(vars(one))
+    other.__dict__.update(one.__dict__)
     return other
 
 
@@ -21,7 +21,7 @@ class Copyable:
     def copy(self) -> Self:
         """Return a copy that can change independently: it copies every attribute that has a `copy`."""
         other = shallow(self)
-        attributes = vars(other)
+        attributes = other.__dict__
         for name, value in attributes.items():
             if _is_mutable(value.__class__):
                 attributes[name] = _copied(value)

@@ -87,7 +87,7 @@ class HealthMonitor(Copyable):
 
     def _beside_gap(self, offered: int) -> Health:
         """Return the health of a good estimate, which is degraded beside a gap of a boundary."""
-        unmapped = [sum(one.unmapped[label] for one in self._recent) for label in BOUNDARIES]
+        unmapped = [*map(sum, zip(*[one.unmapped for one in self._recent], strict=True))]
         most = (1.0 - SHARE_DEGRADED) * (offered + sum(unmapped))
         names = [NAMES[label] for label in BOUNDARIES if unmapped[label] > most]
         if len(names) == len(BOUNDARIES):

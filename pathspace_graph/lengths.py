@@ -49,7 +49,10 @@ class Text(str):
 
 def joined(texts: Iterable[str], separator: str = "; ") -> str:
     """Join the texts that are not empty to one that can be rescaled."""
-    figures = {f"part{k}": text for k, text in enumerate(filter(None, texts))}
+    parts = [*filter(None, texts)]
+    if len(parts) <= 1:
+        return parts[0] if parts else ""
+    figures = {f"part{k}": text for k, text in enumerate(parts)}
     return Text(separator.join(f"{{{name}}}" for name in figures), **figures)
 
 

@@ -2,6 +2,7 @@
 
 import gc
 import time
+from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -110,6 +111,12 @@ def _ask(estimator: OnlineEstimator, method: str, *arguments: Any) -> Any:
     return getattr(estimator, method, lambda *_: None)(*arguments)
 
 
+def outline_of(estimator: OnlineEstimator) -> Map:
+    """Return the present map, without covariances if the estimator has an `outline`."""
+    track: Map | None = _ask(estimator, "outline")
+    return estimator.map() if track is None else track
+
+
 @dataclass(frozen=True, eq=False)
 class ObservedCycle:
     """A finished cycle for observers: its input, its result, and the estimator.
@@ -154,8 +161,7 @@ class ObservedCycle:
     @cached_property
     def outline(self) -> Map:
         """Return the present map, without covariances if the estimator has an `outline`."""
-        track: Map | None = _ask(self.estimator, "outline")
-        return self.estimator.map() if track is None else track
+        return outline_of(self.estimator)
 
     @cached_property
     def map(self) -> Map:
@@ -247,16 +253,19 @@ def run_online(
     name: str = "fixed-lag",
     snapshot_times: Sequence[float] | Array = (),
     observers: Sequence[Observer] = (),
+    outlines: bool = False,
 ) -> RunResult:
     """Feed a log to an online estimator, cycle by cycle, never reading ahead.
 
-    The result has copies of the map at the `snapshot_times` (s, ascending). `observers` are called after each
-    cycle, and their time is not counted. BLAS runs on one thread. Between cycles the run waits for batches,
-    and garbage collection excludes objects older than the run.
+    The result has copies of the map at the `snapshot_times` (s, ascending) and at the end of each lap; with
+    `outlines` they have no covariances, which take most of the memory of a long drive. `observers` are called
+    after each cycle, and their time is not counted. BLAS runs on one thread. Between cycles the run waits for
+    batches, and garbage collection excludes objects older than the run.
     """
     check_type("log", log, Log)
     check_type("estimator", estimator, OnlineEstimator)
-    run = _Run(estimator, [float(t) for t in snapshot_times], observers)
+    map_of = outline_of if outlines else type(estimator).map
+    run = _Run(estimator, map_of, [float(t) for t in snapshot_times], observers)
     with threadpool_limits(limits=1), spared_by_collector():
         for odometry, detections in split_odometry(log):
             run.cycle(odometry, detections)
@@ -265,13 +274,17 @@ def run_online(
 
 class _Run:
     def __init__(
-        self, estimator: OnlineEstimator, times: Sequence[float], observers: Sequence[Observer]
+        self,
+        estimator: OnlineEstimator,
+        map_of: Callable[[OnlineEstimator], Map],
+        times: Sequence[float],
+        observers: Sequence[Observer],
     ) -> None:
-        self._estimator, self._observers = estimator, observers
+        self._estimator, self._map_of, self._observers = estimator, map_of, observers
         self._observing = self._waited = 0.0
         self._snapshot_times, self._snapshots = deque(times), list[Map]()
         self._laps, self._lap_maps = LapCounter(), list[tuple[int, Map]]()
-        self._poses, self._records = list[Array](), list[CycleRecord]()
+        self._poses, self._records = array("d"), list[CycleRecord]()
 
     def cycle(self, odometry: Odometry, detections: Detections) -> None:
         self._take_snapshots(before=detections.t)
@@ -280,8 +293,8 @@ class _Run:
         lap_before = self._laps.lap
         lap = self._laps.update(times(np.asarray(result.pose), POSE_LENGTHS, 1.0 / scale(self._estimator)))
         if lap > lap_before:
-            self._lap_maps.append((lap_before, self._estimator.map()))
-        self._poses.append(np.array(result.pose, dtype=float))
+            self._lap_maps.append((lap_before, self._map_of(self._estimator)))
+        self._poses.extend(result.pose)
         number = len(self._records)
         cycle = ObservedCycle(self._estimator, detections, result, number, seconds, lap, processor)
         self._records.append(cycle.record)
@@ -326,7 +339,7 @@ class _Run:
     def _take_snapshots(self, before: float) -> None:
         while self._snapshot_times and self._snapshot_times[0] < before:
             self._snapshot_times.popleft()
-            self._snapshots.append(self._estimator.map())
+            self._snapshots.append(self._map_of(self._estimator))
 
 
 def settings_dict(settings: Any) -> dict[str, Any]:

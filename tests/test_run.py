@@ -127,6 +127,20 @@ def run(cycles: int, poses: np.ndarray | None = None, **options: Any) -> tuple[A
     return run_online(make_log(np.array([0.0]), t), estimator, **options), estimator
 
 
+def test_outlines_are_maps_of_laps_and_snapshots_without_covariances() -> None:
+    class Outlined(Counting):
+        def outline(self) -> Map:
+            return Map(False, {LEFT: PointBoundary(np.zeros((self.count, 2)), np.zeros((0, 0)))})
+
+    poses = circles(2.1)
+    log = make_log(np.array([0.0]), np.arange(len(poses)) / 10.0)
+    result = run_online(log, Outlined(poses), snapshot_times=[5.0], outlines=True)
+    assert [track.left.size for _, track in result.lap_maps] == [201, 401]
+    assert all(track.left.covariance.size == 0 for _, track in result.lap_maps)
+    assert [track.left.size for track in result.snapshots] == [51]
+    assert result.map.left.covariance.shape == (840, 840)
+
+
 def test_every_cycle_has_its_record_and_its_pose() -> None:
     poses = circles(0.1, 100)
     seen: list[ObservedCycle] = []

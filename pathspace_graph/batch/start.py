@@ -17,7 +17,7 @@ from pathspace_graph.factors.se2 import path_lengths, relative, rotated, to_map,
 from pathspace_graph.front_end.front_end import JudgedLog
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import Elimination, linear_graph
-from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.graph.relative import Revisit, revisit_rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult, VehicleState
@@ -66,7 +66,7 @@ class CurveMapper(OnlineEstimator, Protocol):
 
 def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
     """Run an online estimator; return its final map with all of its poses, and the run."""
-    run, state = run_online(log, mapper), State()
+    run, state = run_online(log, mapper, outlines=True), State()
     for label, known in mapper.boundaries.items():
         boundary = Boundary(known.knots, known.periodic, exact_settings(known.settings), known.gauge)
         boundary.confirmed_end = known.confirmed_end
@@ -135,8 +135,7 @@ class AlignedOdometry:
 
     def system(self) -> Elimination:
         """Linearize the problem at the present values."""
-        rows = self.chain.rows(self.poses, self.calibration)
-        rows += [one.rows(self.poses) for one in self.revisits]
+        rows = self.chain.rows(self.poses, self.calibration) + revisit_rows(self.revisits, self.poses)
         return Elimination(linear_graph(rows, self.variables), self.variables.layout)
 
     def disagreement(self, poses: Array) -> float:

@@ -12,7 +12,7 @@ from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
-from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.graph.relative import Revisit, revisit_rows
 from pathspace_graph.graph.rows import Rows, at_values, by_widths
 from pathspace_graph.graph.variables import POINT, Layout, are_poses, pose_keys
 from pathspace_graph.mapping.curve_map import CurveMap
@@ -194,7 +194,7 @@ class BatchSystem:
         `hold` fixes the sigmas for later evaluations. Their dependence on the curve's direction has no
         derivative.
         """
-        drive = self.drive_rows(state) + [one.rows(state.poses) for one in self.revisits]
+        drive = self.drive_rows(state) + revisit_rows(self.revisits, state.poses)
         drive += [at_values(rows, state.variables) for rows in self.factors]
         across, u = self._across(state, hold) if state.boundaries else (NO_ROWS, np.zeros(0))
         along = self._along(state, self.matches) if self.matches else NO_ROWS

@@ -293,7 +293,7 @@ def map_online(
     times = summary.lap_times(log)
     with progress("mapping", len(log.cycles)) as advance, solving("an update"):
         watching = [lambda _: advance(), *observers]
-        return run_online(log, estimator, name=name, snapshot_times=times, observers=watching)
+        return run_online(log, estimator, name=name, snapshot_times=times, observers=watching, outlines=True)
 
 
 def report(result: RunResult, log: Log) -> None:

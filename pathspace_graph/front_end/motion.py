@@ -79,8 +79,9 @@ class MotionCheck(Copyable):
         twist, delta = motion.odometry.twist, motion.odometry.delta
         seen = matcher.corrected(detections, twist, is_line)
         limit = GATE_DISTRUSTED if t - self._doubted_at < DISTRUST else self._settings.doubt
-        cones = matcher.excess * detections.covariances[~is_line]
-        self._standstill.add(t, seen.points[~is_line], cones, delta)
+        if may_doubt is not None:
+            cones = matcher.excess * detections.covariances[~is_line]
+            self._standstill.add(t, seen.points[~is_line], cones, delta)
         standing, agrees = self._standing(motion) if may_doubt else None, None
         if standing is None:
             motion, agrees = self._checked(motion, t, seen, may_doubt, limit)

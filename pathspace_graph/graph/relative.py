@@ -8,7 +8,7 @@ is linear in map coordinates does neither: it is linearized at the heading that 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Self
@@ -18,8 +18,9 @@ import numpy as np
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
+from pathspace_graph.factors import se2
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
-from pathspace_graph.factors.se2 import compose, relative, wrap_angle
+from pathspace_graph.factors.se2 import compose, left_of, relative, to_vehicle, wrap_angle
 
 from .gaussian import (
     graph_of,
@@ -234,16 +235,27 @@ class Revisit:
         earlier, later = pose_keys(np.array([self.earlier, self.later]))
         return RelativeFactor(int(earlier), Layout(np.array([later])), self.root, np.zeros(POSE), self.local)
 
-    def residual(self, poses: Array) -> Array:
-        """Return the whitened residual (3,) at the poses (P, 3) of all cycles."""
-        seen = relative(poses[self.earlier], poses[self.later]) - self.local
-        return np.asarray(self.root @ [*seen[:2], wrap_angle(seen[2])])
 
-    def rows(self, poses: Array) -> Rows:
-        """Return the rows on [earlier pose | later pose], linearized at the poses (P, 3) of all cycles."""
-        frame, values = poses[self.earlier], poses[self.later]
-        layout = Layout(pose_keys(np.array([self.later])))
-        jacobian = [by_frame_of(values, frame, layout), rotations(layout, frame[2]).T]
-        keys = np.tile(pose_keys(np.array([self.earlier, self.later])), (POSE, 1))
-        owner = np.full(POSE, -1 - self.later)  # a factor of its own, since its poses are far apart
-        return Rows(keys, self.root @ np.concatenate(jacobian, axis=1), self.residual(poses), owner)
+def revisit_rows(revisits: Sequence[Revisit], poses: Array) -> list[Rows]:
+    """Return the rows on [earlier pose | later pose], linearized at the poses (P, 3) of all cycles.
+
+    They are one group, or none without revisits. Those of one later pose are a factor of their own, since the
+    earlier one is far away.
+    """
+    if not revisits:
+        return []
+    ends = np.array([(one.earlier, one.later) for one in revisits])
+    frame, other = poses[ends.T]
+    turn, moved = se2.rotations(frame[:, 2]), other - frame
+    off = np.column_stack([(moved[:, None, :2] @ turn)[:, 0], moved[:, 2]])
+    off -= [one.local for one in revisits]
+    off[:, 2] = wrap_angle(off[:, 2])
+    by_other = np.tile(np.eye(POSE), (len(ends), 1, 1))
+    by_other[:, :2, :2] = turn.transpose(0, 2, 1)
+    by_frame = -by_other
+    by_frame[:, :2, 2] = -left_of(to_vehicle(other[:, :2], frame))
+    by_ends = np.concatenate([by_frame, by_other], axis=2)
+    jacobian = np.concatenate([one.root @ by for one, by in zip(revisits, by_ends, strict=True)])
+    residual = np.concatenate([one.root @ own for one, own in zip(revisits, off, strict=True)])
+    keys, owner = np.repeat(pose_keys(ends), POSE, axis=0), np.repeat(-1 - ends[:, 1], POSE)
+    return [Rows(keys, jacobian, residual, owner)]

@@ -56,6 +56,7 @@ _FIRST_LANDMARK: Final = letter_keys(LANDMARK_LETTER)[0]
 _FIRST_CONTROL: Final = tuple(letter_keys(letter)[0] for letter in CONTROL_LETTERS)
 _SIZES: Final = (POINT, SENSOR_SIZE, POSE)
 _LETTERS: Final = (CALIBRATION_LETTER, SENSOR_LETTER, *CONTROL_LETTERS, LANDMARK_LETTER, POSE_LETTER)
+_PLACES: Final = {letter: 2 * k for k, letter in enumerate(_LETTERS)}  # of the ends of a letter's block
 _LETTER_ENDS: Final = np.array([letter_keys(letter) for letter in _LETTERS], np.intp).ravel()
 
 
@@ -151,7 +152,7 @@ class Layout:
         return kernels.spread(self.starts[places], self.widths[places])
 
     def block(self, letter: str) -> slice:
-        first = 2 * _LETTERS.index(letter)
+        first = _PLACES[letter]
         return slice(*self._letter_ends[first : first + 2])
 
 

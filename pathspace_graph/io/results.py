@@ -74,7 +74,7 @@ CYCLE_COLUMNS: Final = {  # columns of `cycles.csv` with their types; any furthe
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class CycleRecord:
     """One row of `cycles.csv` (FORMATS)."""
 

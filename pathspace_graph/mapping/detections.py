@@ -152,9 +152,9 @@ class DetectionColumns:
 
     def keep_from(self, cycle: int) -> None:
         """Remove the detections of all cycles before `cycle`."""
-        first = int(self.cycle.searchsorted(cycle))
+        first, columns = int(self.cycle.searchsorted(cycle)), vars(self)
         for column in self._columns():
-            vars(self)[column] = vars(self)[column][first:]
+            columns[column] = columns[column][first:]
 
     def in_cycles(self, cycles: IntArray) -> BoolArray:
         """Whether each detection (m,) is of one of the ascending cycles (k,)."""

@@ -43,7 +43,7 @@ def _map_of(road: Road, sigma_size: float) -> Map:
         joint, blocks = joint_covariance_of(list(outlooks.values()), joint, road.poses[-1])
     boundaries = {
         label: SplineBoundary(
-            outlook.spline, joint[block, block].copy(), outlook.confirmed_until, track.placed_cones(label)
+            outlook.spline, joint[block, block], outlook.confirmed_until, track.placed_cones(label)
         )
         for (label, outlook), block in zip(outlooks.items(), blocks, strict=True)
     }

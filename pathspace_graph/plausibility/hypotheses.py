@@ -106,10 +106,10 @@ def pairs_of(cycles: Sequence[Detections]) -> Pairs | None:
     first, second, gaps = np.concatenate(pairs, axis=1)
     if len(first) == 0:
         return None
-    points, variances = _padded(full)
-    both = variances[first][:, :, None] + variances[second][:, None]
-    begin, end = stamps[first], stamps[second]
-    return Pairs(begin, end, points[first], points[second], both, gaps, EXPLAINED_REACH * spacing)
+    points, variances = _padded([full[k] for k in np.concatenate([first, second]).tolist()])
+    (before, after), (early, late) = np.split(points, 2), np.split(variances, 2)
+    both = early[:, :, None] + late[:, None]
+    return Pairs(stamps[first], stamps[second], before, after, both, gaps, EXPLAINED_REACH * spacing)
 
 
 def _padded(cycles: Sequence[Detections]) -> tuple[Array, Array]:
@@ -248,14 +248,14 @@ class Trials:
 
     def __init__(self, log: Log, pairs: Pairs) -> None:
         self.log, self.pairs = log, pairs
-        self._poses: dict[Hypothesis, Array] = {}  # by meaning of the odometry
+        self._poses: dict[Hypothesis, Array] = {}  # of the newest meaning of the odometry
 
     def motion(self, hypothesis: Hypothesis) -> Array:
         """Return the motion (P, 3) of the vehicle from the earlier to the later cycle of each pair."""
         odometry, pairs = self.log.odometry, self.pairs
         meaning = replace(hypothesis, turn=0.0, mirrored=False, late=0.0)
         if meaning not in self._poses:
-            self._poses[meaning] = meaning.poses(odometry)
+            self._poses = {meaning: meaning.poses(odometry)}  # one: trials of a meaning follow each other
         begin, end = pairs.begin - hypothesis.late, pairs.end - hypothesis.late
         return motions(odometry.t, self._poses[meaning], begin, end)
 

@@ -134,6 +134,8 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
         if step > LONGEST_STEP and fitting:
             unit = factors[file] = fitting[0]
             found.append(hint_of("unit of stamps", file=file, step=step, unit=TIME_UNITS[unit], factor=unit))
+    if not factors:
+        return log, []
     of_odometry, of_cycles = (factors.get(file, 1.0) for file in (ODOMETRY_FILE, DETECTIONS_FILE))
     odometry = replace(log.odometry, t=log.odometry.t * of_odometry)
     cycles = tuple(replace(cycle, t=cycle.t * of_cycles) for cycle in log.cycles)
