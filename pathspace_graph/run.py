@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from functools import cached_property
+from operator import methodcaller
 from math import nan
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
@@ -264,7 +265,7 @@ def run_online(
     """
     check_type("log", log, Log)
     check_type("estimator", estimator, OnlineEstimator)
-    map_of = outline_of if outlines else type(estimator).map
+    map_of = outline_of if outlines else methodcaller("map")
     run = _Run(estimator, map_of, [float(t) for t in snapshot_times], observers)
     with threadpool_limits(limits=1), spared_by_collector():
         for odometry, detections in split_odometry(log):
