@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from functools import cached_property
-from operator import methodcaller
 from math import nan
+from operator import methodcaller
 from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
