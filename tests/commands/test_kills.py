@@ -145,7 +145,6 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     monkeypatch.setattr(f"{study}.cells.summarize", lambda *_, **__: {})
     monkeypatch.setattr(f"{study}.runner.made", lambda _: versions() | {"date": "then"})
     monkeypatch.setattr(f"{study}.tables.plot_differences", lambda *_: Figure())
-    monkeypatch.setattr(f"{study}.faults.plot_faults", lambda *_: Figure())
     track = write_round_track(tmp_path)
     (tmp_path / "small.toml").write_text(STUDY.format(track=track))
     folder = tmp_path / "folder"
