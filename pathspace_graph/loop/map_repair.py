@@ -181,7 +181,7 @@ class MapRepair(Copyable):
     def end(self, marginal: LapMarginal | None) -> str:
         """End an attempt; return its notice, which is empty if the batch does not repair the map.
 
-        It must explain the contradictions, and more cones than it takes from the curves.
+        It must explain half of the contradictions, and no fewer cones than it takes from the curves.
         """
         stretches, self._stretches = self._stretches, []
         if marginal is None:
