@@ -19,9 +19,7 @@ from pathspace_graph.sim.curves import along_polyline, arc_lengths
 from pathspace_graph.spline.bspline import BSpline, segments_cross
 
 MISSED_DISTANCE: Final = 3.0  # distance from its boundary beyond which a cone is missed (m; Table 1)
-GHOST_DISTANCE: Final = (
-    2.0  # beyond which a mapped point is a ghost (m): more than drift, less than a lane of 3 m
-)
+GHOST_DISTANCE: Final = 2.0  # distance from its boundary beyond which a mapped point is a ghost (m)
 TRUE_STEP: Final = 0.02  # largest step on a true curve (m): 0.1 m is at most 0.5 mm too long
 MAPPED_STEP: Final = 0.1  # largest step on a mapped curve (m)
 GRID_PER_SPAN: Final = 64  # grid points of a span for closest points, about every 0.1 m

@@ -26,7 +26,7 @@ from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import GrowthSettings
-from pathspace_graph.spline.boundary import Boundary, ahead_of, sampled
+from pathspace_graph.spline.boundary import ahead_of, sampled
 from pathspace_graph.spline.bspline import BSpline
 
 from .closing import SIGMA_STEP
@@ -154,7 +154,7 @@ class MapRepair(Copyable):
         track, state = smoother.map, smoother.map.state
         longest = max(boundary.length for boundary in state.boundaries.values())
         self._lap = poses[lap_begin(poses, longest) :]
-        self._mapped = {label: mapped_cones(track, label)[1] for label in state.boundaries}
+        self._mapped = {label: mapped_cones(track, label) for label in state.boundaries}
         splines = {label: refitted(track, label, self._stretches, poses) for label in state.boundaries}
         return ClosedMap(splines, poses, state.variables.calibrations.copy())
 
@@ -187,10 +187,10 @@ class MapRepair(Copyable):
         if marginal is None:
             return ""
         now, explained = marginal.poses[len(marginal.poses) - len(self._lap) :], [0, 0]
+        curves = {label: KDTree(sampled(spline, SAMPLE)) for label, spline in marginal.splines.items()}
 
         def distances(label: int, cones: Array) -> Array:
-            curve = KDTree(sampled(marginal.splines[label], SAMPLE))
-            return np.asarray(curve.query(carried(cones, self._lap, now))[0])
+            return np.asarray(curves[label].query(carried(cones, self._lap, now))[0])
 
         for stretch in stretches:
             near = distances(stretch.label, stretch.cones) < REPAIR_BESIDE
@@ -251,8 +251,8 @@ def refitted(track: CurveMap, label: int, stretches: list[ContradictedStretch], 
     chosen = [stretch for stretch in stretches if stretch.label == label]
     if not chosen:
         return state.spline(label)
-    boundary, cones = mapped_cones(track, label)
-    lap, stations = newest_lap(poses, boundary.length)
+    cones = mapped_cones(track, label)
+    lap, stations = newest_lap(poses, state.boundaries[label].length)
     at = along_and_across(cones, lap, stations)[0]
     for stretch in chosen:
         new_at = along_and_across(stretch.cones, lap, stations)[0]
@@ -263,11 +263,11 @@ def refitted(track: CurveMap, label: int, stretches: list[ContradictedStretch], 
     return fit_through(cones[np.argsort(at)], True, settings, settings.batch.dense_share)
 
 
-def mapped_cones(track: CurveMap, label: int) -> tuple[Boundary, Array]:
-    """Return a boundary and the cones (k, 2) on its curve, or points at regular distances on a line."""
+def mapped_cones(track: CurveMap, label: int) -> Array:
+    """Return the cones (k, 2) on the curve of a boundary, or points at regular distances on a line."""
     boundary, spacing = track.state.boundaries[label], track.settings.spline.spacing
     u = track.cones.get(label, np.arange(boundary.tables.low, boundary.tables.high, spacing))
-    return boundary, boundary.evaluate(track.state.control_points(label), u)
+    return boundary.evaluate(track.state.control_points(label), u)
 
 
 def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:

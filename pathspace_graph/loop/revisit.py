@@ -36,12 +36,12 @@ from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.registration import (
     BEGINNING_SHARE,
     HEADING,
-    START_CHI2,
     START_STEP,
     Motion,
     RefinedMotion,
     Registration,
     Sightings,
+    are_possible,
     by_motion,
     is_lost,
     sigma_of_information,
@@ -226,8 +226,9 @@ def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple
     centre, middle = state.poses[-1, :2], points[-count:].mean(axis=0)
     turned = rotations(turn) @ (middle - centre) + centre
     motions = np.column_stack([places - turned, wrap_angle(turn)])
-    possible = np.einsum("ij,jk,ik->i", motions, prior, motions) < START_CHI2
-    best = _minima(np.where(possible, unlike, np.inf), int(settings.overlap / step))[:STRETCHES]
+    best = _minima(np.where(are_possible(motions, prior), unlike, np.inf), int(settings.overlap / step))[
+        :STRETCHES
+    ]
     return [(motions[i], float(step * i)) for i in best]
 
 

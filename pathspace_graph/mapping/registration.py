@@ -25,7 +25,7 @@ BEGINNING_SHARE: Final = 0.6  # largest share of a short curve that counts as it
 REGISTERED_REACH: Final = 3.0  # largest distance from the curves in the first iteration (m)
 REGISTERED_SHRINK: Final = 0.7  # factor for each further iteration, down to `closing.inlier_distance`
 REGISTERED_ITERATIONS: Final = 7
-START_STEP: Final = 2.0  # distance of the poses of the beginning at which a lost vehicle is tried (m)
+START_STEP: Final = 2.0  # distance of the poses of the beginning at which a place is tried (m)
 START_CHI2: Final = 16.3  # largest squared Mahalanobis distance of these: 99.9 % of chi-square, 3 degrees
 RIVAL_APART: Final = 1.5  # least distance of two different places (m); gaps between cones are larger
 REGISTERED_DETECTIONS: Final = 25  # least number of registered detections
@@ -192,7 +192,7 @@ def register(
     starts = beginning[first] - state.poses[-1]
     starts[:, 2] = wrap_angle(starts[:, 2])
     if lost:
-        likely = [vector, *_within(starts, prior)]
+        likely = [vector, *starts[are_possible(starts, prior)]]
         inliers = [registration.match(Motion(centre, v), REGISTERED_REACH).inlier.sum() for v in likely]
         vector = likely[int(np.argmax(inliers))]
     found = registration.refine(Motion(centre, vector), np.zeros(3), prior)
@@ -210,7 +210,7 @@ def _has_rival(registration: Registration, found: RefinedMotion, starts: Array, 
     covariance of one optimum does not know of others.
     """
     motion, labels = found.motion, list(registration.state.boundaries)
-    for start in _within(starts - motion.vector, prior) + motion.vector:
+    for start in starts[are_possible(starts - motion.vector, prior)]:
         other = registration.refine(Motion(motion.centre, start), np.zeros(3), prior)
         apart = np.hypot(*(other.motion.vector - motion.vector)[:2])
         if apart > RIVAL_APART and agrees(other.matches, labels, registration.settings):
@@ -218,10 +218,9 @@ def _has_rival(registration: Registration, found: RefinedMotion, starts: Array, 
     return False
 
 
-def _within(motions: Array, information: Array) -> Array:
-    """Select the motions (k, 3) that a prior with mean zero allows."""
-    chi2 = np.einsum("ki,ij,kj->k", motions, information, motions)
-    return np.asarray(motions[chi2 < START_CHI2])
+def are_possible(motions: Array, information: Array) -> BoolArray:
+    """Whether a prior with mean zero and information (3, 3) allows the motions (k, 3)."""
+    return np.asarray(np.einsum("ki,ij,kj->k", motions, information, motions) < START_CHI2)
 
 
 def is_within_reach(track: CurveMap, times: Sequence[float], settings: ClosingSettings) -> bool:
