@@ -226,9 +226,8 @@ def _starts(state: State, prior: Array, settings: ClosingSettings) -> list[tuple
     centre, middle = state.poses[-1, :2], points[-count:].mean(axis=0)
     turned = rotations(turn) @ (middle - centre) + centre
     motions = np.column_stack([places - turned, wrap_angle(turn)])
-    best = _minima(np.where(are_possible(motions, prior), unlike, np.inf), int(settings.overlap / step))[
-        :STRETCHES
-    ]
+    possible = are_possible(motions, prior)
+    best = _minima(np.where(possible, unlike, np.inf), int(settings.overlap / step))[:STRETCHES]
     return [(motions[i], float(step * i)) for i in best]
 
 
