@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.residuals import greville
-from pathspace_graph.factors.se2 import rotation
+from pathspace_graph.factors.se2 import left_of, rotation
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 
@@ -52,51 +52,68 @@ def map_nees(track: Map, truth: Truth) -> NormalizedError:
     every estimator is judged alike. A map holds no covariance between its boundaries, so errors that they
     share (above all its heading) count twice: the mean of `ratio` over many runs is right, but it spreads
     more widely than a chi-squared one.
+
+    The covariance is that of small errors. A turn of the whole map by a degree moves its far side by a metre
+    along the boundary, whose bends would then count as errors of shape. So the truth is laid on the map by
+    its turn, and that of a closed map by its size too; both then count to first order. An open map hardly
+    shows its size.
     """
+    found = _fitted(track, truth, 2 if track.closed else 1)
+    laid = np.nan_to_num([*(one.value for one in found), 0.0][:2])
+    truth_laid = aligned(truth, *laid)
     value, dof = 0.0, 0
     for label, boundary in track.boundaries.items():
         if isinstance(boundary, SplineBoundary):
-            error, covariance = curve_errors(boundary, true_curve(truth, label))
+            error, covariance = curve_errors(boundary, true_curve(truth_laid, label), laid)
         else:
-            error, covariance = landmark_errors(boundary, cones_of(truth, label))
+            error, covariance = landmark_errors(boundary, cones_of(truth_laid, label), laid)
         value += _squared(error, covariance)
         dof += len(error)
     return NormalizedError(value, dof)
 
 
-def curve_errors(boundary: SplineBoundary, curve_true: Array) -> tuple[Array, Array]:
-    """Return e_j = n_j . (q_j - S(u_j)), (k,) in m, and its covariance N B Sigma B' N', (k, k) in m^2.
+def curve_errors(boundary: SplineBoundary, curve_laid: Array, laid: Array) -> tuple[Array, Array]:
+    """Return errors e_j (k,) in m and their covariance N B Sigma B' N' (k, k) in m^2.
 
-    A row for each control point, at its Greville abscissa u_j, so that the covariance is regular; abscissae
-    beyond the ends of an open curve become one row at the end. n_j is the unit normal at u_j, q_j the nearest
-    point of the true curve (n, 2).
+    `e_j = n_j . (q_j - p_j - [J p_j, p_j] laid)` with the place p_j = S(u_j), its unit normal n_j, and the
+    nearest point q_j of the true curve (n, 2), which was `laid` (2,) on the map by a turn (rad) and the
+    logarithm of a scale about the start. J turns by 90 degrees to the left. A row for each control point, at
+    its Greville abscissa u_j, so that the covariance is regular; abscissae beyond the ends of an open curve
+    become one row at the end.
     """
     spline = boundary.spline
-    if len(curve_true) == 0:
+    if len(curve_laid) == 0:
         return np.zeros(0), np.zeros((0, 0))
     u = greville(spline.knots, spline.degree)[: spline.size]
     low, high = spline.domain
     u = low + np.mod(u - low, high - low) if spline.periodic else np.unique(np.clip(u, low, high))
     normal, position = spline.normal_unit(u), spline.evaluate(u)
-    nearest = curve_true[KDTree(curve_true).query(position)[1]]
-    error = np.einsum("kd,kd->k", normal, nearest - position)
+    nearest = curve_laid[KDTree(curve_laid).query(position)[1]]
+    error = np.einsum("kd,kd->k", normal, nearest - position - _moved(position, laid))
     design = np.einsum("km,kd->kmd", spline.basis_matrix(u), normal).reshape(len(u), -1)
     return error, design @ boundary.covariance @ design.T
 
 
-def landmark_errors(boundary: PointBoundary, cones: Array) -> tuple[Array, Array]:
-    """Return cone - landmark, (2 k,) in m over x0, y0, x1, ..., and its covariance (2 k, 2 k) in m^2.
+def landmark_errors(boundary: PointBoundary, cones_laid: Array, laid: Array) -> tuple[Array, Array]:
+    """Return errors (2 k,) in m over x0, y0, x1, ..., and their covariance (2 k, 2 k) in m^2.
 
-    Landmarks and cones (n, 2) are paired with the smallest total distance. A pair more than 3 m apart is left
-    out: it is a missed cone and a ghost, not an error.
+    The error of a landmark p with the cone c is `c - p - [J p, p] laid`, as `curve_errors` has it. Landmarks
+    and cones (n, 2) are paired with the smallest total distance. A pair more than 3 m apart is left out: it
+    is a missed cone and a ghost, not an error.
     """
-    distances = cdist(boundary.points, cones) if len(cones) and boundary.size else np.zeros((0, 0))
+    distances = cdist(boundary.points, cones_laid) if len(cones_laid) and boundary.size else np.zeros((0, 0))
     landmark, cone = scipy.optimize.linear_sum_assignment(np.minimum(distances, MISSED_DISTANCE))
     paired = distances[landmark, cone] <= MISSED_DISTANCE
     landmark, cone = landmark[paired], cone[paired]
     columns = (2 * landmark[:, None] + np.arange(2)).ravel()
-    error = (cones[cone] - boundary.points[landmark]).ravel()
+    points = boundary.points[landmark]
+    error = (cones_laid[cone] - points - _moved(points, laid)).ravel()
     return error, boundary.covariance[np.ix_(columns, columns)]
+
+
+def _moved(points: Array, laid: Array) -> Array:
+    """First-order motion (k, 2) of points (k, 2) by a turn (rad) and the logarithm of a scale (2,)."""
+    return np.asarray(laid[0] * left_of(points) + laid[1] * points)
 
 
 def consistency_at_cones(track: Map, truth: Truth) -> dict[str, float]:

@@ -15,7 +15,8 @@ from pathspace_graph.eval.metrics.consistency import (
     normal_errors,
     with_marginals,
 )
-from pathspace_graph.io.map import Map, SplineBoundary
+from pathspace_graph.factors.se2 import left_of, rotation
+from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT
 from pathspace_graph.spline.bspline import BSpline
 
@@ -23,7 +24,7 @@ from .straight_maps import landmarks, line, row, truth
 
 
 def test_errors_of_a_curve_are_one_for_each_control_point_and_have_its_covariance() -> None:
-    error, covariance = curve_errors(line(2.3, sigma=0.2), true_curve(truth(row(2.0)), LEFT))
+    error, covariance = curve_errors(line(2.3, sigma=0.2), true_curve(truth(row(2.0)), LEFT), np.zeros(2))
     np.testing.assert_allclose(error, -0.3)  # the truth is to the right of the curve
     basis = line(2.3).spline.basis_matrix(np.array([0.0, 10 / 3, 20 / 3, 10.0]))
     np.testing.assert_allclose(covariance, 0.04 * basis @ basis.T, atol=1e-12)
@@ -32,17 +33,17 @@ def test_errors_of_a_curve_are_one_for_each_control_point_and_have_its_covarianc
 def test_errors_of_a_floating_curve_have_a_regular_covariance() -> None:
     points = np.column_stack([np.arange(6.0) * 2, np.zeros(6)])
     floating = SplineBoundary(BSpline.open_uniform(points, interval=2.0), 0.01 * np.eye(12))
-    error, covariance = curve_errors(floating, row(0.0, (0.0, 4.0, 8.0)))
+    error, covariance = curve_errors(floating, row(0.0, (0.0, 4.0, 8.0)), np.zeros(2))
     assert len(error) == 4  # those of the two outermost control points fall on the ends
     assert np.linalg.cond(covariance) < 100.0
 
 
 def test_landmarks_are_paired_one_to_one_and_ghosts_are_no_errors() -> None:
     boundary = landmarks((0.1, 2.0), (0.3, 2.0), (5.0, 2.2), (30.0, 30.0))
-    error, covariance = landmark_errors(boundary, row(2.0))
+    error, covariance = landmark_errors(boundary, row(2.0), np.zeros(2))
     np.testing.assert_allclose(error, [-0.1, 0.0, 0.0, -0.2], atol=1e-12)
     assert covariance.shape == (4, 4)
-    assert len(landmark_errors(landmarks(), row(2.0))[0]) == 0
+    assert len(landmark_errors(landmarks(), row(2.0), np.zeros(2))[0]) == 0
 
 
 def test_nees_of_honest_maps_is_one_per_degree_and_lies_in_its_interval_95_times_of_100() -> None:
@@ -103,3 +104,26 @@ def test_marginals_are_the_squared_basis_of_the_paper() -> None:
     expected = np.einsum("kj,kj,ka,jab,kb->k", basis, basis, normal, blocks, normal)
     np.testing.assert_allclose(sigmas**2, expected, rtol=1e-2)
     assert not np.allclose(normal_errors(track, truth(cones))[1], sigmas, rtol=0.1)
+
+
+@pytest.mark.parametrize("of_curves", [True, False])
+@pytest.mark.parametrize("of_size", [True, False])
+def test_an_exact_map_off_by_some_sigmas_of_its_turn_or_size_adds_their_square(
+    of_curves: bool, of_size: bool
+) -> None:
+    """The bends of a ring move by metres, which is no error of its shape."""
+    angle, breaks = np.linspace(0.0, 2 * np.pi, 41)[:-1], 6.0 * np.arange(41)
+    bends = 12.0 * np.column_stack([np.zeros(40), np.sin(5 * angle)])
+    ring = 40.0 * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)]) + bends
+    sigma = 0.02 if of_size else np.deg2rad(1.0)
+    exact = BSpline.periodic_from(breaks, ring)
+    cones = exact.evaluate(np.linspace(*exact.domain, 81)[:-1]) if of_curves else ring
+    values = []
+    for off in sigma * np.arange(4):
+        points = np.exp(off) * ring if of_size else ring @ rotation(off).T
+        lever = (points if of_size else left_of(points)).ravel()
+        covariance = 0.05**2 * np.eye(80) + sigma**2 * np.outer(lever, lever)
+        curve = SplineBoundary(BSpline.periodic_from(breaks, points), covariance)
+        boundary = curve if of_curves else PointBoundary(points, covariance)
+        values.append(map_nees(Map(True, {LEFT: boundary}), truth(cones)).value)
+    np.testing.assert_allclose(np.subtract(values, values[0]), [0.0, 1.0, 4.0, 9.0], rtol=0.1, atol=0.1)
