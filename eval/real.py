@@ -34,6 +34,7 @@ RUNS: Final = {  # estimator of each run
     "batch": registry.DEFAULT_BATCH,
     "landmarks": "landmark-fixed-lag",
 }
+UNMEASURED: Final = "the noise of the log was not measured"  # why there is no reference
 ERRORS: Final = {  # errors of the sensor in the table, with titles and units
     "latency": ("latency [ms]", 1e3),
     "yaw": ("yaw [°]", 180.0 / np.pi),
@@ -51,11 +52,11 @@ class RealDrive:
     ends: dict[str, Array]  # last pose (3,) of each run
     rows: dict[str, dict[str, Any]]  # metrics of each run
     dead_reckoned: Array  # last pose (3,) by odometry alone
-    registered: Array | None  # last pose (3,) by registration, where the drive comes back to its beginning
+    registered: Array | str  # last pose (3,) by registration, or why there is none
 
     def off(self, pose: Array) -> tuple[float, float]:
         """Return how far (m) and by what angle (degrees) a last pose (3,) is from that by registration."""
-        if self.registered is None:
+        if isinstance(self.registered, str):
             return np.nan, np.nan
         turn = float(wrap_angle(np.array(pose[2] - self.registered[2])))
         return float(np.hypot(*(pose[:2] - self.registered[:2]))), float(np.rad2deg(turn))
@@ -83,12 +84,12 @@ def _drive(cells: Sequence[EstimatorCell], out: Path, records: Mapping[str, Reco
         {name: read_trajectory(folder / TRAJECTORY_FILE)[1][-1] for name, folder in runs.items()},
         {name: records[cell.id]["rows"][-1] for name, cell in zip(RUNS, cells, strict=True)},
         seen[-1].pose,
-        None if log.measured is None else end_by_registration(seen, log.measured),
+        UNMEASURED if log.measured is None else end_by_registration(seen, log.measured),
     )
 
 
 def runs_table(drives: Sequence[RealDrive]) -> Table:
-    """Return a row for each run."""
+    """Return a row for each run; the name of one without a reference says why."""
     header = (
         *("log, run", "closed [%]", "end off by [m]", "turned by [°]"),
         *("dead reckoning off by [m]", "dead reckoning turned by [°]", "crossings", "own crossings"),
@@ -102,7 +103,8 @@ def runs_table(drives: Sequence[RealDrive]) -> Table:
             values = [100.0 * row["closed_at_end"], *drive.off(drive.ends[name]), *reckoned, *crossed]
             values += [100.0 * row.get(f"reported_{word}", np.nan) for word in ("degraded", "lost")]
             values.append(row.get("ms_processor", np.nan))
-            rows.append((f"{drive.name}, {name}", *Quantity.row(values, 0, 2, 1, 2, 1, 0, 0, 1, 1, 1)))
+            why = f" (no reference: {drive.registered})" if isinstance(drive.registered, str) else ""
+            rows.append((f"{drive.name}, {name}{why}", *Quantity.row(values, 0, 2, 1, 2, 1, 0, 0, 1, 1, 1)))
     return Table(header, tuple(rows))
 
 

@@ -188,7 +188,7 @@ def _values_without_truth(run: RunResult, log: Log) -> dict[str, float]:
     values: dict[str, float] = {"crossings": sum(accuracy.crossings(run.map))}
     if log.measured is not None and len(run.trajectory):
         end = end_by_registration(seen_cycles(log)[0], log.measured)
-        if end is not None:
+        if not isinstance(end, str):
             values["end_off"] = float(np.hypot(*(run.trajectory[-1, :2] - end[:2])))
     return values
 

@@ -10,46 +10,48 @@ from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.noise import MeasuredNoise
-from pathspace_graph.factors.se2 import compose, move_points, to_map, to_vehicle
-from pathspace_graph.factors.sensor import by_sensor
+from pathspace_graph.factors.noise import MeasuredNoise, huber_weights
+from pathspace_graph.factors.se2 import compose, left_of, move_points, rotated, wrap_angle
 from pathspace_graph.front_end.sightings import ConeTracker, SeenCycle
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.sim.curves import arc_lengths
 
-FIRST, LAST = 25.0, 14.0  # lengths of the beginning of a drive, and of its end that is registered on it (m)
 LEAST: Final = 6  # least number of cones of a registration, and of cycles in which a vehicle stands
 NEAR: Final = 12.0  # range within which cones tell that a vehicle stands (m)
+FAR: Final = 30.0  # range within which they are registered (m): farther ones scatter by metres
+GATES: Final = (2.5, 2.0, 1.5, 1.5, 1.5)  # distances of paired cones (m)
+SEEN_SHARE: Final = 0.2  # least share of the cycles in which a cone is seen
+HUBER: Final = 1.5  # whitened distance beyond which Huber's loss reduces the weight of a cone
+DRIFTED: Final = (2.0, 2.0, 0.1)  # standard deviations of dead reckoning at the end of a lap (m, m, rad)
 STAYS: Final = 0.5  # most median distance of a cycle's cones from those of one of the last (m)
 TOGETHER: Final = 9  # cycles that are looked at together
 MOST_STANDING: Final = 100  # most cycles in which it stands
+NOT_STANDING: Final = "the vehicle stands at the {} for fewer than " + str(LEAST) + " cycles"
+TOO_FEW: Final = f"fewer than {LEAST} cones are seen standing at the start and at the end"
 
 
-def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Array | None:
-    """Return the last pose (3,) of a drive, by the cones of its end laid on those of its beginning.
+def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Array | str:
+    """Return the last pose (3,) of a drive, by the cones seen standing at its end and at its start.
 
-    The closest points of the same colour are paired, from starts around dead reckoning. The end is where the
-    vehicle stands, or else the last metres; the beginning is short enough for odometry. The constant errors
-    of the sensor are taken out.
+    The closest points of the same colour are paired, from starts around dead reckoning, and the near ones
+    weigh most. No motion, latency or odometry is in the result: odometry misses the first decimetres of a
+    start, and goes on after a stop. The constant errors of the sensor are taken out. A text says why there is
+    no result.
     """
-    poses = np.array([cycle.pose for cycle in cycles])
-    path = arc_lengths(poses[:, :2])
-    if path[-1] < FIRST + LAST:
-        return None
-    first = [cycle for cycle, s in zip(cycles, path, strict=True) if s <= FIRST]
-    last = standing(cycles) or [c for c, s in zip(cycles, path, strict=True) if s >= path[-1] - LAST]
-    start = [_cones(first, label, noise, np.zeros(3)) for label in BOUNDARIES]
-    end = [_cones(last, label, noise, poses[-1]) for label in BOUNDARIES]
+    sides = {"start": standing(cycles[::-1]), "end": standing(cycles)}
+    for side, own in sides.items():
+        if not own:
+            return NOT_STANDING.format(side)
+    start, end = ([_cones(own, label, noise) for label in BOUNDARIES] for own in sides.values())
     tries = [
-        _registered(start, end, compose(poses[-1], np.array(offset)))
+        _registered(start, end, compose(cycles[-1].pose, np.array(offset)))
         for offset in product((-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-0.1, 0.0, 0.1))
     ]
-    count, _, pose = max(tries, key=lambda one: one[:2])
-    return pose if count >= LEAST else None
+    score, pose = max(tries, key=lambda one: one[0] - _drifted(one[1], cycles[-1].pose))
+    return np.append(pose[:2], wrap_angle(pose[2:])) if score > 0.0 else TOO_FEW
 
 
 def standing(cycles: Sequence[SeenCycle]) -> list[SeenCycle]:
-    """Return the newest cycles in which near cones stay where they are, all at the last pose.
+    """Return the last of these cycles in which near cones stay where they are.
 
     Odometry may go on while the vehicle stands, so the cones decide. Empty where they are too few cycles.
     """
@@ -58,43 +60,64 @@ def standing(cycles: Sequence[SeenCycle]) -> list[SeenCycle]:
     most = KDTree(max(near[-TOGETHER:], key=len))
     moved = [np.median(most.query(points)[0]) if most.n and len(points) else np.inf for points in near]
     stays = median_filter(np.array(moved) < STAYS, TOGETHER, mode="nearest")  # single cycles see few cones
-    count = int(np.argmin(stays[::-1])) if not stays.all() else len(stays)
-    return [replace(one, pose=cycles[-1].pose) for one in cycles[-count:]] if count >= LEAST else []
+    count = int(np.argmin(stays[::-1])) - TOGETHER // 2 if not stays.all() else len(stays)
+    return list(cycles[-count:]) if count >= LEAST else []
 
 
-def _cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise, frame: Array) -> Array:
-    """Return the cones (k, 2) of a label in the frame of a pose (3,), each the mean of those within 15 m."""
+def _drifted(pose: Array, reckoned: Array) -> float:
+    """Squared distance of a pose (3,) from dead reckoning, in its standard deviations."""
+    off = pose - reckoned
+    off[2] = wrap_angle(off[2])
+    return float(np.square(off / DRIFTED).sum())
+
+
+def _cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise) -> tuple[Array, Array]:
+    """Return the cones (k, 2) of a vehicle that stands, vehicle frame, and their covariances (k, 2, 2)."""
     own = []
     for cycle in cycles:
         seen = cycle.detections
-        chosen = (seen.labels == label) & (np.hypot(*seen.points_vehicle.T) < 15.0)
-        own.append(replace(cycle, detections=seen.where(chosen)))
-    table = ConeTracker(noise).follow(own)
-    corrected = table.point + by_sensor(table.point, table.twist) @ noise.sensor
-    points = to_vehicle(to_map(corrected, table.pose), np.tile(frame, (len(table.t), 1)))
-    weights = 1.0 / np.maximum(np.hypot(*table.point.T), 1.0) ** 2
-    again = [rows for cone in np.unique(table.cone) if (rows := table.cone == cone).sum() > 1]
-    means = [np.average(points[rows], axis=0, weights=weights[rows]) for rows in again]
-    return np.array(means).reshape(-1, 2)
+        chosen = (seen.labels == label) & (np.hypot(*seen.points_vehicle.T) < FAR)
+        own.append(replace(cycle, detections=seen.where(chosen), pose=np.zeros(3), twist=np.zeros(3)))
+    table = ConeTracker(noise).follow(sorted(own, key=lambda one: one.detections.t))
+    numbers, counts = np.unique(table.cone, return_counts=True)
+    points, seen_again = noise.corrected(table.point, np.zeros(3)), counts > SEEN_SHARE * len(cycles)
+    means = [points[table.cone == cone].mean(axis=0) for cone in numbers[seen_again]]
+    cones, count = np.array(means).reshape(-1, 2), int(np.median(counts[seen_again])) if means else 1
+    covariances = replace(noise, count=count).covariances(cones, inflated=True)
+    assert covariances is not None
+    return cones, covariances / count
 
 
-def _registered(start: list[Array], end: list[Array], pose: Array) -> tuple[int, float, Array]:
-    """Return the number of paired cones, minus their mean distance, and the pose (3,) for it."""
-    count, distance = 0, np.inf
-    for gate in (2.0, 1.5, 1.0, 1.0, 0.7, 0.7):
-        pairs = []
-        for known, seen in zip(start, end, strict=True):
-            if len(known) and len(seen):
-                away, nearest = KDTree(known).query(move_points(pose, seen))
-                near = away < gate
-                pairs.append((seen[near], known[np.asarray(nearest)[near]]))
-        points, targets = (np.concatenate([np.zeros((0, 2)), *side]) for side in zip(*pairs, strict=True))
-        count = len(points)
+def _registered(
+    start: list[tuple[Array, Array]], end: list[tuple[Array, Array]], pose: Array
+) -> tuple[float, Array]:
+    """Return the score of a registration and its pose (3,), by Gauss-Newton on nearest cones.
+
+    Each paired cone adds 9 less its squared distance in sigmas.
+    """
+    score = 0.0
+    for gate in GATES:
+        information, vector, score, count = 1e-9 * np.eye(3), np.zeros(3), 0.0, 0
+        for (known, known_covariance), (seen, seen_covariance) in zip(start, end, strict=True):
+            if not len(known) or not len(seen):
+                continue
+            points = move_points(pose, seen)
+            distance, nearest = map(np.asarray, KDTree(known).query(points))
+            rows = np.flatnonzero(distance < gate)
+            off = points[rows] - known[nearest[rows]]
+            W = np.linalg.inv(known_covariance[nearest[rows]] + rotated(seen_covariance[rows], pose[None, 2]))
+            square = np.einsum("ki,kij,kj->k", off, W, off)
+            W *= huber_weights(np.sqrt(square), HUBER)[:, None, None]
+            J = np.concatenate(
+                [np.tile(np.eye(2), (len(rows), 1, 1)), left_of(points[rows] - pose[:2])[:, :, None]], axis=2
+            )
+            information += np.einsum("kia,kij,kjb->ab", J, W, J)
+            vector += np.einsum("kia,kij,kj->a", J, W, off)
+            score, count = score + float(np.maximum(9.0 - square, 0.0).sum()), count + len(rows)
         if count < LEAST:
-            return 0, -np.inf, pose
-        pose = motion_onto(points, targets)
-        distance = float(np.hypot(*(move_points(pose, points) - targets).T).mean())
-    return count, -distance, pose
+            return 0.0, pose
+        pose = pose - np.linalg.solve(information, vector)
+    return score, pose
 
 
 def motion_onto(points: Array, onto: Array) -> Array:
