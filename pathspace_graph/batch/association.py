@@ -34,6 +34,7 @@ POSE_STEP: Final = 1.0  # step of the curve in the search of the point nearest t
 DIRECTION_PENALTY: Final = 100.0  # distance added in quadrature where the curve runs against a heading (m)
 FOOT_ROOM: Final = 1.5  # room in which the foot point of a cone is searched (m along the curve)
 PASS_STRETCH: Final = 5.0  # largest distance of a cone from the poses that pass it (m along the curve)
+COURSE: Final = 2.0  # stretch of a drive that gives its direction (m)
 POSE_ROOM: Final = (
     2.0  # largest excess of the distance of two poses along an open curve over the driven one (m)
 )
@@ -61,10 +62,11 @@ def insert_drive(variables: Variables, calibration: Array, poses: Array) -> None
 def locate_poses(state: State) -> None:
     """Set `pose_u`, the parameter of the nearest point of each curve in the direction of each pose.
 
-    It increases from lap to lap on a closed curve. On an open curve, which may have drifted over itself, it
-    follows the driven path.
+    A vehicle faces along the road, or moves along it while it spins. The parameter increases from lap to lap
+    on a closed curve. On an open curve, which may have drifted over itself, it follows the driven path.
     """
     poses = state.poses
+    courses = np.concatenate([courses_of(poses[part]) for part in state.drives.parts(len(poses))])
     for label, boundary in state.boundaries.items():
         count = int(np.ceil(boundary.length / POSE_STEP))
         u = boundary.tables.low + boundary.length * (np.arange(count) + 0.5) / count
@@ -72,7 +74,7 @@ def locate_poses(state: State) -> None:
         tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
         square = (poses[:, :1] - position[:, 0]) ** 2
         square += (poses[:, 1:2] - position[:, 1]) ** 2
-        against = headings(poses) @ tangent.T < SAME_DIRECTION
+        against = np.maximum(headings(poses) @ tangent.T, courses @ tangent.T) < SAME_DIRECTION
         np.add(square, DIRECTION_PENALTY**2, out=square, where=against)
         if boundary.periodic:
             state.pose_u[label] = _from_lap_to_lap(u[square.argmin(axis=1)], boundary.length, state.drives)
@@ -114,6 +116,17 @@ def _along(square: Array, steps: Array) -> IntArray:
 def headings(poses: Array) -> Array:
     """Unit vectors (m, 2) of the headings of poses (m, 3)."""
     return np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+
+
+def courses_of(poses: Array) -> Array:
+    """Unit vectors (m, 2) of the directions in which a drive with poses (m, 3) moves, over `COURSE` metres.
+
+    Zero for a drive that stands.
+    """
+    driven = path_lengths(poses)
+    before, after = driven - 0.5 * COURSE, driven + 0.5 * COURSE
+    x, y = (np.interp(after, driven, p) - np.interp(before, driven, p) for p in poses[:, :2].T)
+    return np.asarray(np.column_stack([x, y]) / np.maximum(np.hypot(x, y), np.finfo(float).tiny)[:, None])
 
 
 # --- detections on the curves ----------------------------------------------------------------------------
