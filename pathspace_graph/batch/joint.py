@@ -120,7 +120,8 @@ class JointSystem(BatchSystem):
         poses = state.poses[self.drives.parts(len(state.poses))[drive]]
         one = self.placed[drive]
         back = compose(one.state.poses[0], inverse(poses[0]))
-        return disagreement(one.alone.system, compose(back, poses))
+        calibration = state.variables.calibration.reshape(-1, CALIBRATION_SIZE)[drive]
+        return disagreement(one.alone.system, compose(back, poses), calibration)
 
 
 def in_drive(rows: Rows, number: int, first_cycle: int) -> Rows:

@@ -1,20 +1,22 @@
 """Evidence against an optimum: against closing a loop on it, and against the map as a whole."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import path_lengths, to_map
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.lengths import Length, Text, joined
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import at_level_crossing, boundaries_cross, crossings, sampled
+from pathspace_graph.spline.boundary import boundaries_cross, sampled
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.crossing import crossed_boundaries, crossings_told
 
 from .start import aligned_odometry
 from .system import BatchSystem, Evaluation
@@ -27,14 +29,28 @@ MISS_DETECTIONS: Final = 20  # least number of detections of such a stretch
 MISS_NEAR: Final = (
     2.5  # largest distance of near detections from the drive, relative to the used ones' median
 )
+SAME_CONE: Final = 0.5  # distance of two detections of one cone, as the optimum places them (m)
+SEEN_AGAIN: Final = 0.25  # least number of detections of a cone, relative to the median of the used ones
 MISS_SHARE: Final = 1.0 / 3.0  # least share of near detections on no boundary that is a miss
 MISS_SHOWN: Final = 3  # largest number of reported stretches
 
 
+def are_of_cones(detections: DetectionTable, points: Array) -> BoolArray:
+    """Whether each detection at points (m, 2), map frame, has others beside it about as used ones have.
+
+    False detections are scattered. They are evidence neither for a map nor against it.
+    """
+    if not detections.used.any():
+        return np.ones(len(points), bool)
+    count = np.asarray(KDTree(points).query_ball_point(points, SAME_CONE, return_length=True))
+    return np.asarray(count >= SEEN_AGAIN * np.median(count[detections.used]))
+
+
 def share_used(at: Evaluation, detections: DetectionTable) -> float:
-    """Share of the coloured detections of the first lap that lie on the curves of an optimum."""
+    """Share of the coloured detections of cones of the first lap that lie on the curves of an optimum."""
     state = at.state
     coloured = np.isin(detections.label, list(state.boundaries))
+    coloured &= are_of_cones(detections, detections.points_map(slice(None), state.variables))
     again = np.ones(len(state.poses), bool)  # beside a previously driven stretch of every boundary
     for label, boundary in state.boundaries.items():
         again &= state.pose_u[label] - state.pose_u[label][0] >= boundary.length
@@ -54,13 +70,12 @@ def objection(splines: Mapping[int, BSpline], poses: Array, used: float, setting
     driven, by_drive = poses[:, :2], KDTree(poses[:, :2])
     if boundaries_cross(splines, SAMPLE, driven):
         return "its boundaries cross"
+    if crossed := crossed_boundaries(splines, driven):
+        return crossings_told(crossed)
     for curve in (sampled(spline, SAMPLE) for spline in splines.values()):
         distance, beside = map(np.asarray, KDTree(curve).query(driven))
         aside = float(np.percentile(distance, DRIVE_PERCENTILE))
         missing = np.flatnonzero(np.hypot(*np.diff(driven, axis=0).T) > 2.0 * DRIVE_RATIO * aside)
-        pieces = [piece for piece in np.split(driven, missing + 1) if len(piece) > 1]
-        if any(not at_level_crossing(crossings(curve, piece), driven).all() for piece in pieces):
-            return "the vehicle would have crossed a boundary"
         known = np.ones(len(curve), bool)
         for first, last in zip(beside[missing], beside[missing + 1], strict=True):
             known[np.arange(first, last if last >= first else last + len(curve)) % len(curve)] = False
@@ -76,20 +91,22 @@ def evidence_against(
     system: BatchSystem, at: Evaluation, splines: Mapping[int, BSpline], detections: DetectionTable
 ) -> str:
     """Describe the evidence against closed curves at an optimum, with their detections; empty if none."""
-    poses = at.state.poses
+    poses, calibration = at.state.poses, at.state.variables.calibration
     used = share_used(at, detections)
-    return disagreement(system, poses) or objection(splines, poses, used, system.settings)
+    return disagreement(system, poses, calibration) or objection(splines, poses, used, system.settings)
 
 
-def disagreement(system: BatchSystem, poses: Array) -> str:
+def disagreement(system: BatchSystem, poses: Array, calibration: Array) -> str:
     """Describe how the poses (P, 3) of an optimum contradict odometry and revisits; empty if they agree.
 
     Both are estimates of one drive, so they differ by some standard deviations of the less certain one. A
-    wrong optimum bends the drive by much more, to fit the map.
+    wrong optimum bends the drive by much more, to fit the map. The odometry is corrected by the calibration
+    (2,) of the optimum: what contradicts its prior widens that, and does not bend the drive.
     """
     if not system.revisits:
         return ""
-    sigmas = aligned_odometry(system.chain, system.revisits).disagreement(poses)
+    calibrated = replace(system.chain, calibration_mean=calibration)
+    sigmas = aligned_odometry(calibrated, system.revisits).disagreement(poses)
     return f"the poses are {sigmas:.1f} sigmas from the odometry" if sigmas > BENT_SIGMAS else ""
 
 
@@ -104,6 +121,7 @@ def unmapped(detections: DetectionTable, poses: Array) -> str:
     points = to_map(detections.measured, poses[detections.cycle])
     distance = np.asarray(KDTree(poses[:, :2]).query(points)[0])
     near = distance < MISS_NEAR * np.median(distance[used] if used.any() else distance)
+    near &= are_of_cones(detections, points)
     missed = near & ~used
     if missed.sum() < MISS_SHARE * near.sum():
         return ""

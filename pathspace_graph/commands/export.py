@@ -6,12 +6,20 @@ from pathlib import Path
 import numpy as np
 
 from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.health import LOST
 from pathspace_graph.io import export as formats
 from pathspace_graph.io.export import LocalPlane
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE, read_log
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
-from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory, write_trajectory
+from pathspace_graph.io.parsing import read_table
+from pathspace_graph.io.results import (
+    CYCLES_FILE,
+    SMOOTHED_FILE,
+    TRAJECTORY_FILE,
+    read_trajectory,
+    write_trajectory,
+)
 from pathspace_graph.options.map import Export
 from pathspace_graph.spline.ahead import LEAST_STEP, MOST_POINTS
 from pathspace_graph.spline.crossing import crossed_boundaries, crossings_told
@@ -85,7 +93,11 @@ def check_crossings(track: Map, folder: Path) -> None:
     file = next((file for file in files if file.exists()), None)
     if file is None:
         return
-    crossed = crossings_told(crossed_boundaries(track.splines, read_trajectory(file)[1][:, :2]))
+    path, cycles = read_trajectory(file)[1][:, :2], folder / CYCLES_FILE
+    health = read_table(cycles, {}).columns.get("health", ()) if cycles.exists() else ()
+    lost = np.array([condition == LOST for condition in health])
+    known = ~lost if len(lost) == len(path) else None
+    crossed = crossings_told(crossed_boundaries(track.splines, path, known))
     if crossed:
         raise InputError(folder / MAP_FILE, f"expected the map of the drive in {file.name}: {crossed}")
 

@@ -7,12 +7,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, ray_sigmas
+from pathspace_graph.factors.noise import ASSUMED_DRIFT, MeasuredNoise, RayNoise, ray_sigmas
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.gate import TWIST
-from pathspace_graph.front_end.measurement import DRIFT, LEAST_NOISE
+from pathspace_graph.front_end.measurement import LEAST_NOISE
 from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_UNKNOWN, TwistRecord
+from pathspace_graph.health import LOST
 from pathspace_graph.io.header import CALIBRATION
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
@@ -68,9 +69,11 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any], scale: float = 1.
 
 
 def crossings_of(result: RunResult) -> list[Crossing]:
-    """Return the places where the vehicle crossed the boundaries of its map."""
+    """Return the places where the vehicle crossed the boundaries of its map, unless it was lost there."""
     path = result.trajectory if result.smoothed is None else result.smoothed
-    return crossed_boundaries(result.map.splines, path[:, :2])
+    lost = [record.health == LOST for record in result.cycles]
+    known = ~np.array(lost) if len(lost) == len(path) else None
+    return crossed_boundaries(result.map.splines, path[:, :2], known)
 
 
 NOISE_RANGE: Final = 10.0  # range at which the noise of detections is reported (m, at scale 1)
@@ -151,7 +154,7 @@ def _odometry_hints(log: Log) -> list[Hint]:
     least, interval = white
     agree = orders.max(axis=0) < NOISE_AGREEMENT * least
     small = agree & (least > NOISE_FACTOR * log.odometry_sigma)
-    most = np.hypot(least, DRIFT / np.sqrt(interval))
+    most = np.hypot(least, np.array(ASSUMED_DRIFT) / np.sqrt(interval))
     large = NOISE_FACTOR * most < log.odometry_sigma
     stated, hints = log.odometry_sigma, []
     for which, values, size in ((small, least, "small"), (large, most, "large")):

@@ -55,20 +55,27 @@ def crossings_told(found: list[Crossing]) -> str:
     )
 
 
-def crossed_boundaries(curves: Mapping[int, BSpline], path: Array) -> list[Crossing]:
+def crossed_boundaries(
+    curves: Mapping[int, BSpline], path: Array, known: BoolArray | None = None
+) -> list[Crossing]:
     """Find where a path driven (n, 2) crosses the boundaries of the map, in driving order.
 
-    Not counted: a corner that is cut; the place where the vehicle enters or finally leaves the road; a place
-    where the path crosses itself, since roads that cross have boundaries there; and the boundary of another
-    lap of an open map, whose laps may lie beside each other.
+    Poses that are not `known` (n,), as of a lost vehicle, are a gap. Not counted: a corner that is
+    cut; the place where the vehicle enters or finally leaves the road; a place where the path crosses itself,
+    since roads that cross have boundaries there; and the boundary of another lap of an open map, whose laps
+    may lie beside each other.
     """
+    known = np.ones(len(path), bool) if known is None else known
+    before = np.cumsum(~known)[known]  # number of unknown poses before each known one
+    path = path[known]
     moves = (np.diff(path, axis=0) != 0.0).any(axis=1)
-    path = path[np.append(moves[:1], moves)]
+    kept = np.append(moves[:1], moves)
+    path, before = path[kept], before[kept]
     if len(path) < 2 or not curves:
         return []
     coarse = [curve.evaluate(np.linspace(*curve.domain, COARSE * curve.size)) for curve in curves.values()]
     aside = float(np.median([KDTree(points).query(path)[0] for points in coarse]))
-    drive = _drive(path, aside)
+    drive = _drive(path, np.diff(before) > 0, aside)
     lines = {label: _line(curve, CROSSING_STEP * aside) for label, curve in curves.items()}
     found = [one for label in lines for one in _crossings(label, lines, drive, aside)]
     return sorted(found, key=lambda one: one.driven)
@@ -91,9 +98,10 @@ def _line(curve: BSpline, step: float) -> _Way:
     return _Way(points, curve.tangent_unit(u), path_lengths(points), [slice(0, len(u))], curve.periodic)
 
 
-def _drive(path: Array, aside: float) -> _Way:
+def _drive(path: Array, unknown: BoolArray, aside: float) -> _Way:
+    """Sample a path (n, 2); the way to the next pose may be `unknown` (n - 1,)."""
     length = path_lengths(path)
-    missing = np.flatnonzero(np.diff(length) > DRIVE_GAP * aside) + 1
+    missing = np.flatnonzero(unknown | (np.diff(length) > DRIVE_GAP * aside)) + 1
     known = [rows for rows in np.split(length, missing) if len(rows) > 1]
     at = [np.linspace(rows[0], rows[-1], int(np.ptp(rows) / (CROSSING_STEP * aside)) + 2) for rows in known]
     ends = np.cumsum([0, *map(len, at)]).tolist()

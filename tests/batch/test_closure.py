@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchMapper, find_closed_optimum
-from pathspace_graph.batch.objections import objection, share_used
+from pathspace_graph.batch.objections import are_of_cones, objection, share_used
 from pathspace_graph.batch.optimizer import Optimizer
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import find_revisits
 from pathspace_graph.batch.system import BatchSystem
 from pathspace_graph.front_end.front_end import judge_log
-from pathspace_graph.io.log import Log
+from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.settings.mapper import MapperSettings
@@ -91,7 +91,7 @@ def test_boundaries_that_cross_are_no_road() -> None:
 
 def test_a_vehicle_crosses_no_boundary() -> None:
     against = objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0, 4.0), USED, SETTINGS)
-    assert against == "the vehicle would have crossed a boundary"
+    assert "boundary lies across the driven path" in against
 
 
 def test_a_vehicle_has_driven_beside_all_of_a_boundary() -> None:
@@ -119,6 +119,18 @@ def test_where_cycles_are_missing_nothing_is_asked_of_the_boundaries(begin: floa
 def test_the_detections_of_a_lap_lie_on_its_boundaries() -> None:
     against = objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0), 0.62, SETTINGS)
     assert against == "only 62 % of the detections lie on its boundaries"
+
+
+def test_false_detections_say_nothing_of_a_map_but_cones_beside_it_do() -> None:
+    """Forty cones are seen by ten cycles each, and as many scattered points once."""
+    rng = np.random.default_rng(0)
+    cones = np.repeat(rng.uniform(0.0, 200.0, (40, 2)), 10, axis=0) + 0.05 * rng.normal(size=(400, 2))
+    points = np.concatenate([cones, rng.uniform(0.0, 200.0, (400, 2))])
+    table = DetectionTable.of([Detections(0.0, points, np.tile(np.eye(2), (800, 1, 1)), np.zeros(800, int))])
+    table.used[:200] = True  # the map has every other cone
+    of_cones = are_of_cones(table, points)
+    assert of_cones[:400].all()
+    assert of_cones[400:].mean() < 0.05
 
 
 def test_both_boundaries_of_a_lap_are_closed() -> None:

@@ -119,7 +119,18 @@ def test_an_optimum_that_bends_the_drive_is_refused(sigmas: float, why: str) -> 
     off = BENT_SIGMAS * sigmas
     poses = known.poses + off * np.linalg.cholesky(known.covariances).sum(axis=2)
     assert known.disagreement(poses) == pytest.approx(off)
-    assert disagreement(system, poses) == why.format(off)
-    assert disagreement(system, known.poses) == ""
+    calibration = chain.calibration_mean
+    assert disagreement(system, poses, calibration) == why.format(off)
+    assert disagreement(system, known.poses, calibration) == ""
     system.revisits = ()
-    assert disagreement(system, poses) == ""
+    assert disagreement(system, poses, calibration) == ""
+
+
+def test_a_bias_that_the_optimum_has_found_is_no_disagreement() -> None:
+    """The yaw rate is a hundred sigmas of its prior off."""
+    chain, truth = course()
+    calibration = chain.calibration_mean + chain.calibration_sigma * np.array([0.0, 100.0])
+    measured = replace(drawn_chain(chain, calibration, np.random.default_rng(2)), bias=None)
+    system: Any = SimpleNamespace(chain=measured, revisits=(revisit(truth),))
+    assert disagreement(system, truth, chain.calibration_mean) != ""
+    assert disagreement(system, truth, calibration) == ""
