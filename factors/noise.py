@@ -47,6 +47,11 @@ def huber_roots(whitened: Array, threshold: float) -> Array:
     return np.sign(whitened) * np.sqrt(2.0 * huber_loss(whitened, threshold))
 
 
+ASSUMED_DRIFT: Final = (0.05, 0.05, 0.0017)
+"""Drift of an odometry of which nothing else is known (m, m, rad by root of s): 0.5 m, 0.9 degrees in 90 s.
+
+It is not observable on an open drive: a cone is in view for about 3 s, and the noise of its detections hides
+an error of the speed below 0.05 m/s."""
 SURE: Final = 4.0  # sigmas from which an error of the sensor is significant
 STAYS: Final = 1.5  # growth of the sigma of a cone's mean from which correlated errors count
 
@@ -88,6 +93,34 @@ class RayNoise:
 
 
 @dataclass(frozen=True, eq=False)
+class TwistNoise:
+    """Noise of a measured twist: white noise of each reading, and a drift that lasts for many of them."""
+
+    LENGTHS: ClassVar = {"white": (1, 1, 0), "drift": (1, 1, 0)}
+
+    white: Array  # (3,) standard deviation of a single twist (m/s, m/s, rad/s)
+    drift: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) Random walk of the integrated pose (m, m and rad by root of s)."""
+
+    def sigmas(self, durations: Array) -> Array:
+        """Standard deviations (k, 3) of twists that are held for durations dt (k,), in s.
+
+        `sqrt(white^2 + drift^2 / dt)`: the integral over dt has the variance `white^2 dt^2 + drift^2 dt`.
+        """
+        if not self.drift.any():
+            return np.broadcast_to(self.white, (len(durations), len(self.white)))
+        walk = self.drift**2 / np.maximum(durations, MIN_DURATION)[:, None]
+        return np.asarray(np.sqrt(self.white**2 + walk))
+
+    def of_mean(self, count: int, duration: float) -> Array:
+        """Standard deviation (3,) of the mean of `count` twists over a duration (s)."""
+        return np.asarray(np.sqrt(self.white**2 / count + self.drift**2 / max(duration, MIN_DURATION)))
+
+
+MIN_DURATION: Final = 1e-6  # s; a twist that is held for less moves nothing
+
+
+@dataclass(frozen=True, eq=False)
 class MeasuredNoise:
     """Noise of odometry and detections, measured on the readings of a drive alone."""
 
@@ -116,6 +149,11 @@ class MeasuredNoise:
     range_bend: float = 0.0
     """Bend of the ranges (1/m), see `factors.sensor:by_bend`; 0 if not significant."""
     seconds: float = 0.0  # time of driving that the noise was measured on (s)
+
+    @property
+    def twist(self) -> TwistNoise:
+        """Noise of a twist."""
+        return TwistNoise(self.odometry, self.drift)
 
     @property
     def twist_sigma(self) -> Array:
@@ -191,9 +229,21 @@ def ray_sigmas(points: Array, covariances: Array) -> Array:
 class KnownNoise:
     """Noise as known before a drive."""
 
-    LENGTHS: ClassVar = {"odometry": (1, 1, 0), "measured": 0}
+    LENGTHS: ClassVar = {"odometry": (1, 1, 0), "drift": (1, 1, 0), "measured": 0}
 
     odometry: Array  # (3,) standard deviation of a twist (m/s, m/s, rad/s), stated or assumed
     odometry_stated: bool = True
     detections_stated: bool = True  # whether the log states the covariances of the detections
     measured: MeasuredNoise | None = None  # on the whole of this drive, or on an earlier one
+    sigma_range_scale: float | None = None
+    """Stated standard deviation of the scale error of the ranges (-)."""
+    drift: Array | None = None
+    """(3,) Stated drift of the odometry (m, m and rad by root of s); a white noise says nothing of it."""
+
+    @property
+    def twist(self) -> TwistNoise:
+        """Noise of a twist; an unstated one includes the drift."""
+        drift = self.drift
+        if drift is None:
+            drift = np.array(ASSUMED_DRIFT) if self.odometry_stated else np.zeros(3)
+        return TwistNoise(self.odometry, drift)

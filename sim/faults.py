@@ -74,6 +74,8 @@ class OdometryFaults(Checked, group="faults.odometry"):
     """Time without a measured twist, so that the last one before is held (s)."""
     gap_at: AtLeast0 = 0.5
     """Laps after which the gap begins."""
+    dead_band: AtLeast0 = 0.0
+    """Speed up to which the twists read zero after each standstill (m/s)."""
     false_travel: AtLeast0 = 0.0
     """Speed (m/s) below which the odometry doesn't fall while the vehicle brakes to its last stand."""
     false_travel_time: AtLeast0 = 3.0
@@ -148,12 +150,14 @@ def measure_odometry(
 
 
 def _wheel_twists(driven: Drive, faults: OdometryFaults) -> Array:
-    """Twists (N, 3) of the body, except where the wheels slip or report false travel."""
+    """Twists (N, 3) of the body, except where the odometry slips, misses a start or reports false travel."""
     twists = driven.twists.copy()
     if faults.slip:
         since = driven.t % faults.slip_every
         slips = (since < faults.slip_time) & (driven.t >= faults.slip_every)
         twists *= 1.0 + faults.slip * slips[:, None] * np.array([1.0, 1.0, 0.0])
+    if faults.dead_band:
+        twists[_is_pulling_off(driven.twists, faults.dead_band)] = 0.0
     if faults.false_travel:
         stand = np.flatnonzero(driven.twists.any(axis=1))[-1] + 1
         slow = np.flatnonzero(driven.twists[:stand, 0] > faults.false_travel)[-1:] + 1
@@ -161,6 +165,14 @@ def _wheel_twists(driven: Drive, faults: OdometryFaults) -> Array:
         end = stand + round(faults.false_travel_time / dt)
         twists[int(np.append(slow, stand)[0]) : end, 0] = faults.false_travel
     return twists
+
+
+def _is_pulling_off(twists: Array, speed: float) -> NDArray[np.bool_]:
+    """Whether the vehicle has been below a speed (m/s) since it last stood (N,), from true twists (N, 3)."""
+    row = np.arange(len(twists))
+    stood = np.maximum.accumulate(np.where(twists.any(axis=1), -1, row))
+    faster = np.maximum.accumulate(np.where(np.hypot(twists[:, 0], twists[:, 1]) > speed, row, -1))
+    return np.asarray((stood >= 0) & (faster <= stood))
 
 
 def colours(track: Track, wrong_way: bool) -> IntArray:

@@ -38,8 +38,12 @@ class OdometryNoise(Checked, group="odometry"):
 
         The spectrum at frequency 0: `white^2 + slow^2 (1 + rho) / (1 - rho)`, `rho = exp(-dt / slow_time)`.
         """
+        return np.asarray(np.hypot(self.white, self.drift(dt) / np.sqrt(dt)))
+
+    def drift(self, dt: float) -> Array:
+        """Random walk (3,) of the pose by the slow errors of twists `dt` s apart (m, m, rad by root of s)."""
         rho = np.exp(-dt / self.slow_time)
-        return np.asarray(np.hypot(self.white, np.sqrt((1.0 + rho) / (1.0 - rho)) * np.array(self.slow)))
+        return np.asarray(np.sqrt(dt * (1.0 + rho) / (1.0 - rho)) * np.array(self.slow))
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,9 @@ class SensorSettings(Checked):
     """Probability that a detected boundary cone has the other boundary's label."""
     false_positives: AtLeast0 = 0.03
     """Expected number of detections of nothing in a cycle."""
+    sigma_range_scale: AtLeast0 = 0.0005
+    """Standard deviation of the scale error of the ranges (-) that the log states, as of a calibrated sensor;
+    with 0 it states none."""
     range_bias: bool = False
     """Whether ranges have a systematic error, as those of cameras do."""
     range_bias_at: tuple[float, ...] = (4.0, 9.0)

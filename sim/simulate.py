@@ -116,7 +116,8 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     log = Log(
         odometry=odometry,
         cycles=tuple(cycles),
-        odometry_sigma=np.hypot(settings.odometry.white, settings.odometry.slow),
+        odometry_sigma=np.array(settings.odometry.white),
+        odometry_drift=settings.odometry.drift(1.0 / settings.vehicle.rate),
         sensor=_sensor_info(settings),
         source=_source(track, settings, seed),
         truth=truth,
@@ -141,6 +142,7 @@ def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
         source={**log.source, "draw": "True"},
         odometry_stated=False,
         detections_stated=False,
+        odometry_drift=None,
         truth=truth,
     )
 
@@ -162,7 +164,9 @@ def _bend(sensor: SensorSettings) -> Array | None:
 def _sensor_info(settings: SimulationSettings) -> SensorInfo:
     sensor = settings.sensor
     return SensorInfo(
-        sensor.range_max, sensor.fov, sensor.rate, kind="line" if settings.line.spacing else None
+        *(sensor.range_max, sensor.fov, sensor.rate),
+        kind="line" if settings.line.spacing else None,
+        sigma_range_scale=sensor.sigma_range_scale or None,
     )
 
 

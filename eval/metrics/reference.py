@@ -113,7 +113,7 @@ def with_true_noise(log: Log, associations: IntArray) -> Log:
         change = along * radial + across * (np.eye(2) - radial)
         cycles.append(replace(cycle, covariances=change @ cycle.covariances @ change))
         row += size
-    return replace(log, cycles=tuple(cycles), odometry_sigma=noise[:3])
+    return replace(log, cycles=tuple(cycles), odometry_sigma=noise[:3], odometry_drift=np.zeros(3))
 
 
 def _rays(points: Array) -> tuple[Array, Array]:

@@ -289,7 +289,7 @@ def solve_landmarks(
     associations = associations[~np.concatenate([is_orange(cycle) for cycle in log.cycles])]
     settings = settings or MapperSettings()
     settings = replace(settings, gate=replace(settings.gate, huber=np.inf))
-    system = LandmarkSystem.of_log(log, settings, KnownNoise(log.odometry_sigma))
+    system = LandmarkSystem.of_log(log, settings, KnownNoise(log.odometry_sigma, drift=log.odometry_drift))
     state = start_oracle(system, associations)
     system.optimize(state)
     return system, state

@@ -150,6 +150,7 @@ def to_log(
         sensor=SensorInfo(kind="line" if is_line else None),
         source=record.source,
         odometry_stated=stated is not None,
+        odometry_drift=None if noise.sigma_drift is None else np.array(noise.sigma_drift),
         detections_stated=noise.states_detections or not record.notes[ASSUMED],
     )
 

@@ -64,6 +64,9 @@ class NoiseSettings(Checked, group=""):
     """Each sample of [vx, vy, wz] has these standard deviations (m/s, m/s, rad/s), white from sample to
     sample. Without them they are 0.25, 0.12 and 0.035, or what a data set states of itself. The covariance in
     a message is not used: mostly it is that of a filter's state, which is not white."""
+    sigma_drift: Annotated[tuple[float, float, float] | None, AT_LEAST_0] = None
+    """Drift of the odometry beside that white noise (m, m and rad by root of s): a random walk of the
+    integrated pose. Where it is not stated, 0.05, 0.05 and 0.0017 are assumed."""
     sigma_range: float | None = None
     """Standard deviation of the range at range 0 (m) of a detection without a covariance. Where none of these
     three is stated, they are measured, and without enough cones 0.05, 0.012 and 0.0157."""
@@ -73,6 +76,11 @@ class NoiseSettings(Checked, group=""):
     """Standard deviation of the bearing (rad) of a detection without a covariance."""
     replace_covariances: bool = False
     """All detections have the covariance by these standard deviations, also where the record has another."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sigma_drift is not None and self.sigma_odometry is None:
+            raise SettingsError("sigma_drift: expected sigma_odometry beside it, found none")
 
     @property
     def _own(self) -> tuple[float | None, ...]:

@@ -64,7 +64,7 @@ class FrontEnd(Copyable):
         """Start with the noise known at scale 1; lengths of the cycles are divided by `scale`."""
         self.noise = NoiseLearner(noise, settings.noise, of_lines=settings.kind == "line")
         self.gate = Gate(settings.limits, scale, of_lines=settings.kind == "line")
-        self._motion = MotionCheck(self.noise.twist_sigma, settings.motion)
+        self._motion = MotionCheck(self.noise.twist, settings.motion)
         self._settings = settings
         self._begun = self._sensor_doubted = False
         self._sides = SideJudge(settings.sides)
@@ -114,7 +114,7 @@ class FrontEnd(Copyable):
             settings = replace(settings, calibration=check.errors.found(calibration))
         fresh = noise.observe(odometry, measurable(cones, settings), motion, check.pose)
         if fresh:
-            check.set_noise(noise.twist_sigma)
+            check.set_noise(noise.twist)
         if fresh or not self._begun:
             settings, self._begun = noise.calibrated(self._settings), True
         return None if settings is self._settings else settings
@@ -214,8 +214,10 @@ def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[
     for odometry, _ in readings:
         twists.add(odometry)
     white = odometry_of(twists, None)
-    sigma = log.odometry_sigma if white is None else white.twist_sigma
-    check, sides = MotionCheck(sigma, settings.motion), SideJudge(settings.sides)
+    check, sides = (
+        MotionCheck(log.noise.twist if white is None else white.twist, settings.motion),
+        SideJudge(settings.sides),
+    )
     for odometry, detections in readings:
         cones, _, is_line, in_lane = split_detections(detections, settings)
         motion = check.update(odometry, cones, may_doubt=None, is_line=is_line)

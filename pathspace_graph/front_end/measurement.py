@@ -14,17 +14,19 @@ import numpy as np
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.noise import SURE, MeasuredNoise, RayNoise, huber_weights, ray_axes
+from pathspace_graph.factors.noise import (
+    ASSUMED_DRIFT,
+    SURE,
+    MeasuredNoise,
+    RayNoise,
+    huber_weights,
+    ray_axes,
+)
 from pathspace_graph.factors.se2 import in_vehicle, rotations, to_map
 from pathspace_graph.factors.sensor import BENDS_FROM, SENSOR_SIZE
 
 from .sightings import FOLLOW_RANGE, MAD, MIN_SPEED_SHARE, ConeTracker, SeenCycle, Sightings, TwistRecord
 
-DRIFT: Final = np.array([0.05, 0.05, 0.0017])
-"""Assumed drift of any odometry (m/sqrt(s), m/sqrt(s), rad/sqrt(s)): 0.5 m and 0.9 degrees after 90 s.
-
-It is not observable on an open drive: a cone is in view for about 3 s, and the noise of its detections hides
-an error of the speed below 0.05 m/s."""
 PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02, 0.02])
 """Prior standard deviations of the constants: errors of the sensor (rad, m, s, -, m), bend of its ranges
 (1/m) and bias of the yaw rate (rad/s). Without the bend, yaw, lateral offset and scale would absorb it."""
@@ -314,7 +316,7 @@ def odometry_of(twists: TwistRecord, known: MeasuredNoise | None) -> MeasuredNoi
     if white is None:
         return None
     sigma, interval = white
-    found = known or MeasuredNoise(sigma, DRIFT.copy(), interval)
+    found = known or MeasuredNoise(sigma, np.array(ASSUMED_DRIFT), interval)
     return replace(found, odometry=sigma, interval=interval)
 
 

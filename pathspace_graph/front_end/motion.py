@@ -7,6 +7,7 @@ import numpy as np
 
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.factors.odometry import integrate_twists, integrated_odometry
 from pathspace_graph.factors.se2 import compose, relative, rotation
 from pathspace_graph.io.log import Detections, Odometry
@@ -33,6 +34,7 @@ REST_TIME: Final = 1.0  # time at rest over which the mean yaw rate measures the
 REST_TWIST: Final = (0.1, 0.1, 0.05)  # largest mean twist at rest (m/s, m/s, rad/s), without its noise
 REST_SIGMAS: Final = 3.0  # allowance for the noise of the mean (sigmas)
 SIGMAS_REST: Final = (5e-4, 5e-4, 5e-5)  # motion between cycles at rest by odometry (m, m, rad)
+SIGMAS_PULL_OFF: Final = (0.3, 0.05, 0.0)  # motion that odometry misses when a rest ends (m, m, rad)
 SIGMAS_STANDS: Final = (0.02, 0.02, 0.002)  # motion between cycles at rest by detections alone (m, m, rad)
 
 
@@ -42,8 +44,8 @@ class MotionCheck(Copyable):
     Poses are in the frame of dead reckoning, which drifts; only the newest ones are used.
     """
 
-    def __init__(self, sigma: Array, settings: MotionSettings) -> None:
-        self.sigma = sigma  # (3,) standard deviation of a measured twist (m/s, m/s, rad/s)
+    def __init__(self, noise: TwistNoise, settings: MotionSettings) -> None:
+        self.noise = noise
         self.seen_again: BoolArray = np.zeros(0, bool)  # (m,) `Reading.seen_again` of the newest cycle
         self.pose: Array = np.zeros(3)  # (3,) newest pose by dead reckoning; the first one is 0
         self._settings = settings
@@ -55,9 +57,9 @@ class MotionCheck(Copyable):
         self._t: float | None = None
         self._doubted_at = -np.inf  # stamp of the last contradiction (s)
 
-    def set_noise(self, sigma: Array) -> None:
-        """Set the standard deviation (3,) of a twist, and forget the learned errors of the sensor."""
-        self.sigma = sigma
+    def set_noise(self, noise: TwistNoise) -> None:
+        """Set the noise of a twist, and forget the learned errors of the sensor."""
+        self.noise = noise
         self._matcher.forget()
         self._standstill = Standstill()
 
@@ -75,7 +77,7 @@ class MotionCheck(Copyable):
         """
         is_line = np.zeros(len(detections.labels), bool) if is_line is None else is_line
         t, matcher = detections.t, self._matcher
-        motion = self._twists.integrate(odometry, t, self._t, self.sigma)
+        motion = self._twists.integrate(odometry, t, self._t, self.noise)
         twist, delta = motion.odometry.twist, motion.odometry.delta
         seen = matcher.corrected(detections, twist, is_line)
         limit = GATE_DISTRUSTED if t - self._doubted_at < DISTRUST else self._settings.doubt
@@ -89,8 +91,11 @@ class MotionCheck(Copyable):
             motion = standing
         if motion.doubted:
             self._doubted_at = t
-        if not motion.fault and self._rest.update(odometry, t, self.sigma):
+        rested = self._rest.is_at_rest
+        if not motion.fault and self._rest.update(odometry, t, self.noise):
             motion = self._at_rest(motion, t, seen, limit)
+        if rested and not self._rest.is_at_rest and not motion.fault:
+            motion = motion.with_missed(np.array(SIGMAS_PULL_OFF), self.noise)
         self.pose = compose(self.pose, motion.odometry.delta)
         if agrees is not None and not agrees.by_lines:
             self.seen_again = agrees.is_matched
@@ -124,7 +129,7 @@ class MotionCheck(Copyable):
         if standing is None or matcher.denies(standing, matcher.difference(standing, none, self.pose), limit):
             self._rest.end()
             return motion
-        return MeasuredMotion(none, np.zeros((1, 3)), bias=self._rest.bias(t, self.sigma))
+        return MeasuredMotion(none, np.zeros((1, 3)), bias=self._rest.bias(t, self.noise))
 
     def _standing(self, motion: MeasuredMotion) -> MeasuredMotion | None:
         """Return the motion back to where the vehicle stands, if the cones clearly show a standstill."""
@@ -216,13 +221,15 @@ class HeldTwists(Copyable):
         self._interval = np.inf  # shortest time between measured twists (s)
         self._accelerations = np.array(settings.accelerations)
 
-    def integrate(self, odometry: Odometry, t: float, before: float | None, sigma: Array) -> MeasuredMotion:
+    def integrate(
+        self, odometry: Odometry, t: float, before: float | None, noise: TwistNoise
+    ) -> MeasuredMotion:
         """Integrate the twists from the previous cycle, at `before` (s), to t (s).
 
-        The noise of a twist, with the standard deviation sigma (3,), grows while it is held for long.
+        The noise of a twist grows while it is held for long.
         """
         if len(odometry.t) == 0:
-            none = integrate_odometry(odometry, t, sigma)  # no motion, with certainty
+            none = integrate_odometry(odometry, t, noise)  # no motion, with certainty
             return MeasuredMotion(none, odometry.twist, missing=before is not None)
         measured = odometry.t
         goes_on = self.newest is not None and (odometry.twist[0] == self.newest).all()
@@ -236,7 +243,7 @@ class HeldTwists(Copyable):
         excess, missing, durations = np.zeros(3), bool(held[-1] > 0.0), ends - odometry.t
         if missing or held.any():
             excess = held[:, None] * self._accelerations
-        integrated = integrate_twists(durations, odometry.twist, np.hypot(sigma, excess))
+        integrated = integrate_twists(durations, odometry.twist, np.hypot(noise.sigmas(durations), excess))
         same = (odometry.twist[1:] == odometry.twist[:-1]).all(axis=1)  # to the last digit
         stuck = bool(same.sum() >= STUCK)
         return MeasuredMotion(integrated, odometry.twist, False, missing, stuck, None, durations, excess)
@@ -249,16 +256,17 @@ class Rest(Copyable):
         self.end()
 
     def end(self) -> None:
+        self.is_at_rest = False  # whether the vehicle has been at rest for `REST_TIME`
         self._since: float | None = None
         self._sum, self._count = np.zeros(3), 0
         self._measured_since = self._rate_sum = 0.0
         self._rate_count = 0
 
-    def update(self, odometry: Odometry, t: float, sigma: Array) -> bool:
-        """Whether the vehicle has been at rest for `REST_TIME` at t (s), by twists with a sigma (3,)."""
+    def update(self, odometry: Odometry, t: float, noise: TwistNoise) -> bool:
+        """Whether the vehicle has been at rest for `REST_TIME` at t (s), by twists with some noise."""
         twists = odometry.twist[1:] if len(odometry.twist) > 1 else odometry.twist  # the first one is held
-        moves = not len(twists) or twists[:, 0].min() > REST_TWIST[0] + REST_SIGMAS * sigma[0]
-        if moves or not _is_still(twists.mean(axis=0), len(twists), sigma):
+        moves = not len(twists) or twists[:, 0].min() > REST_TWIST[0] + REST_SIGMAS * noise.white[0]
+        if moves or not _is_still(twists.mean(axis=0), noise.of_mean(len(twists), t - odometry.t[0])):
             self.end()
             return False
         if self._since is None:
@@ -266,17 +274,22 @@ class Rest(Copyable):
         self._sum, self._count = self._sum + twists.sum(axis=0), self._count + len(twists)
         self._rate_sum += float(twists[:, 2].sum())
         self._rate_count += len(twists)
-        return _is_still(self._sum / self._count, self._count, sigma) and t - self._since >= REST_TIME
+        still = _is_still(self._sum / self._count, noise.of_mean(self._count, t - self._since))
+        self.is_at_rest = still and t - self._since >= REST_TIME
+        return self.is_at_rest
 
-    def bias(self, t: float, sigma: Array) -> BiasMeasurement | None:
+    def bias(self, t: float, noise: TwistNoise) -> BiasMeasurement | None:
         """Return the bias measured since the last result, if that is `REST_TIME` ago at t (s)."""
         if t - self._measured_since < REST_TIME:
             return None
-        mean, sigma_mean = self._rate_sum / self._rate_count, float(sigma[2]) / np.sqrt(self._rate_count)
+        mean, sigma = (
+            self._rate_sum / self._rate_count,
+            noise.of_mean(self._rate_count, t - self._measured_since),
+        )
         self._measured_since, self._rate_sum, self._rate_count = t, 0.0, 0
-        return BiasMeasurement(mean, sigma_mean)
+        return BiasMeasurement(mean, float(sigma[2]))
 
 
-def _is_still(mean: Array, count: int, sigma: Array) -> bool:
-    """Whether the mean (3,) of `count` twists with a sigma (3,) is consistent with rest."""
-    return bool((np.abs(mean) < REST_TWIST + REST_SIGMAS * sigma / np.sqrt(count)).all())
+def _is_still(mean: Array, sigma: Array) -> bool:
+    """Whether a mean twist (3,) with a standard deviation (3,) is consistent with rest."""
+    return bool((np.abs(mean) < REST_TWIST + REST_SIGMAS * sigma).all())

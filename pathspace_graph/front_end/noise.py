@@ -10,8 +10,8 @@ import numpy as np
 
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
-from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
-from pathspace_graph.factors.sensor import SENSOR, SENSOR_SIZE
+from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, TwistNoise
+from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import NoiseSource, RunNoise
 from pathspace_graph.mapping.motion import MeasuredMotion
@@ -25,7 +25,8 @@ FIRST: Final = 8.0  # driving time before the first measurement of noise (s)
 AGAIN: Final = 1.5  # growth of the driving time between measurements
 MOST_CYCLES: Final = 300  # largest number of newest cycles in a measurement, which bounds its time
 DRIVING_SPEED: Final = 0.3  # least speed of driving (m/s)
-SCALE: Final = SENSOR.index("range_scale")  # index of the scale error of the ranges
+SCALE, BIAS = SENSOR.index("range_scale"), SENSOR.index("range_bias")
+"""Indices of the errors of the ranges."""
 SIGMA_FREE: Final = 0.02  # prior sigma of the scale of the ranges where odometry sets the size (-)
 REFERENCE_RANGE: Final = 10.0  # range at which the noise of ranges bounds their scale error (m)
 
@@ -63,10 +64,10 @@ class NoiseLearner(Copyable):
         return not self.of_detections or (self.measured is not None and self.measured.along is not None)
 
     @property
-    def twist_sigma(self) -> Array:
+    def twist(self) -> TwistNoise:
         if self.of_odometry and self.measured is not None:
-            return self.measured.twist_sigma
-        return self.known.odometry
+            return self.measured.twist
+        return self.known.twist
 
     def observe(
         self, odometry: Odometry, detections: Detections, motion: MeasuredMotion, pose: Array
@@ -118,22 +119,29 @@ class NoiseLearner(Copyable):
         The first seconds, before any measurement, determine the heading of the map.
         """
         if self.of_odometry and self.measured is not None:
-            return [motion.with_sigma(self.twist_sigma) for motion in motions]
+            return [motion.with_noise(self.twist) for motion in motions]
         return motions
 
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
-        """Return settings with measured priors of all calibrations if one of the old priors is contradicted.
+        """Return settings with measured priors of the sensor's errors, if the old ones cannot be relied on.
 
-        `|c - mean| > doubt hypot(sigma, sigma_prior)` contradicts the prior of an error c. Only the ratio of
-        ranges and speeds is observable, so one of their scales is fixed.
+        `|c - mean| > doubt hypot(sigma, sigma_prior)` contradicts the prior of an error c. The scale of the
+        ranges keeps its own as long as that is known. Otherwise only the ratio of ranges and speeds is
+        observable, so one of their scales is fixed.
         """
-        measured, sensor = self.measured, settings.calibration
-        contradicted = self._contradicted(settings)
-        if measured is None or not contradicted.any():
+        settings = self._with_stated(settings)
+        measured, sensor = self._measured_errors(settings), settings.calibration
+        if measured is None:
+            return settings
+        contradicted = _contradicted(measured, settings)
+        known = self._knows_range_scale(measured, settings, contradicted)
+        if not contradicted.any() and (known or sensor.trust is not None):
             return settings
         sigmas = np.maximum(measured.sensor_sigma, sensor.sigmas)
         odometry, means = settings.odometry, measured.sensor.copy()
-        if self.trusts_odometry(settings):
+        if known:
+            means[SCALE], sigmas[SCALE] = sensor.range_scale, sensor.sigma_range_scale
+        elif self.trusts_odometry(settings):
             odometry = replace(odometry, hold_scale=True)
             sigmas[SCALE] = SIGMA_FREE
         else:
@@ -145,21 +153,43 @@ class NoiseLearner(Copyable):
         priors |= {f"sigma_{name}": sigma for name, sigma in zip(SENSOR, sigmas.tolist(), strict=True)}
         return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
 
-    def _contradicted(self, settings: MapperSettings) -> BoolArray:
-        """Return which measured errors (5,) of the sensor contradict their priors."""
-        measured, sensor = self.measured, settings.calibration
-        if not self.of_sensor or measured is None or measured.along is None or not sensor.sensor:
-            return np.zeros(SENSOR_SIZE, bool)
-        off = np.abs(measured.sensor - sensor.means)
-        prior = np.array(sensor.sigmas)
-        prior[SCALE] = np.hypot(prior[SCALE], settings.odometry.sigma_scale)
-        return np.asarray(off > sensor.doubt * np.hypot(measured.sensor_sigma, prior))
+    def _with_stated(self, settings: MapperSettings) -> MapperSettings:
+        """Return settings with the standard deviation of the ranges' scale that the log states."""
+        stated, sensor = self.known.sigma_range_scale, settings.calibration
+        if stated is None or stated == sensor.sigma_range_scale:
+            return settings
+        return replace(settings, calibration=replace(sensor, sigma_range_scale=stated))
+
+    def _measured_errors(self, settings: MapperSettings) -> MeasuredNoise | None:
+        """Return the measurement with the constant errors of the sensor; None if they are not used."""
+        measured = self.measured
+        if (
+            not self.of_sensor
+            or not settings.calibration.sensor
+            or measured is None
+            or measured.along is None
+        ):
+            return None
+        return measured
+
+    def _knows_range_scale(
+        self, measured: MeasuredNoise, settings: MapperSettings, contradicted: BoolArray
+    ) -> bool:
+        """Whether the prior of the ranges' scale is what is known of the sensor.
+
+        The log states it, or at least covariances: then somebody knows the sensor. Ranges that bend, or with
+        a `contradicted` (5,) scale, are not calibrated. Those with a bias hardly are, unless the log says so.
+        """
+        if settings.calibration.trust is not None or contradicted[SCALE] or measured.range_bend:
+            return False
+        return self.known.sigma_range_scale is not None or not (self.of_detections or contradicted[BIAS])
 
     def used(self, settings: MapperSettings) -> RunNoise:
         """Return the noise in use, and the reading that sets the map's size if ranges and speeds disagree."""
         measured, known = self.measured, self.known
         size: Literal["odometry", "ranges"] | None = None
-        if self._contradicted(settings)[SCALE]:
+        errors = self._measured_errors(settings)
+        if errors is not None and _contradicted(errors, self._with_stated(settings))[SCALE]:
             size = "odometry" if self.trusts_odometry(settings) else "ranges"
         has_rays = measured is not None and measured.along is not None
         odometry = _source(known.odometry_stated, self.of_odometry, measured is not None)
@@ -177,6 +207,14 @@ class NoiseLearner(Copyable):
             return trust == "odometry"
         sigma = float(measured.along.sigmas(np.array([REFERENCE_RANGE]))[0])
         return sigma > REFERENCE_RANGE * settings.odometry.sigma_scale
+
+
+def _contradicted(measured: MeasuredNoise, settings: MapperSettings) -> BoolArray:
+    """Return which measured errors (5,) of the sensor contradict their priors."""
+    sensor, prior = settings.calibration, np.array(settings.calibration.sigmas)
+    prior[SCALE] = np.hypot(prior[SCALE], settings.odometry.sigma_scale)
+    off = np.abs(measured.sensor - sensor.means)
+    return np.asarray(off > sensor.doubt * np.hypot(measured.sensor_sigma, prior))
 
 
 def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:

@@ -40,6 +40,7 @@ Error = tuple[Number, Positive]  # an error of the sensor and its sigma
 
 class _Odometry(Struct):
     sigma: tuple[Positive, Positive, Positive]
+    drift_sigmas: tuple[AtLeast0, AtLeast0, AtLeast0] | None = None
 
 
 class _Sensor(Struct, frozen=True):
@@ -47,6 +48,7 @@ class _Sensor(Struct, frozen=True):
     fov: Positive | None = None
     rate: Positive | None = None
     kind: Kind | None = None
+    sigma_range_scale: Positive | None = None
 
 
 class _Measured(Struct, kw_only=True):

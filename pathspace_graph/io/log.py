@@ -127,6 +127,8 @@ class SensorInfo:
     """Perception cycles per second, Hz."""
     kind: Kind | None = None
     """What detections are of."""
+    sigma_range_scale: float | None = None
+    """Standard deviation of the scale error of the ranges (-): how well the sensor is calibrated."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -170,7 +172,7 @@ class Log:
 
     LENGTHS: ClassVar = {
         **dict.fromkeys(("odometry", "cycles", "sensor", "measured", "truth"), 0),
-        "odometry_sigma": POSE_LENGTHS,
+        **dict.fromkeys(("odometry_sigma", "odometry_drift"), POSE_LENGTHS),
     }
 
     odometry: Odometry
@@ -185,6 +187,9 @@ class Log:
     """Whether somebody has stated the noise of the odometry; otherwise it was measured or assumed."""
     detections_stated: bool = True
     """Whether somebody has stated the covariances of the detections."""
+    odometry_drift: Array | None = None
+    """Stated drift (3,) of the odometry in m, m and rad by root of s, a random walk of the integrated pose.
+    None where nobody has stated it: the white noise says nothing of it."""
     measured: MeasuredNoise | None = None
     """Noise and constant errors of the sensor, as the readings themselves show them."""
     truth: Truth | None = None
@@ -240,7 +245,9 @@ class Log:
 
     @property
     def noise(self) -> KnownNoise:
-        return KnownNoise(self.odometry_sigma, self.odometry_stated, self.detections_stated, self.measured)
+        stated = self.odometry_stated, self.detections_stated
+        scale, drift = self.sensor.sigma_range_scale, self.odometry_drift
+        return KnownNoise(self.odometry_sigma, *stated, self.measured, scale, drift)
 
 
 def read_log(folder: Path | str) -> Log:
@@ -259,6 +266,7 @@ def read_log(folder: Path | str) -> Log:
         source={key: str(value) for key, value in header.source.items()},
         odometry_stated=header.noise.odometry == headers.STATED,
         detections_stated=header.noise.detections == headers.STATED,
+        odometry_drift=None if (drift := header.odometry.drift_sigmas) is None else np.array(drift),
         measured=headers.measured_noise(header, file),
         truth=_read_truth(folder, len(table), headers.true_errors(header, file)),
     )
@@ -372,7 +380,7 @@ def _sections(log: Log) -> dict[str, dict[str, Any]]:
         values = getattr(log.truth, name, None)
         truth |= {} if values is None else dict(zip(entries, values, strict=True))
     return {
-        "odometry": {"sigma": log.odometry_sigma},
+        "odometry": {"sigma": log.odometry_sigma, "drift_sigmas": log.odometry_drift},
         "sensor": vars(log.sensor),
         **headers.noise_sections(log.odometry_stated, log.detections_stated, log.measured),
         "source": {headers.toml_text(key): value for key, value in log.source.items()},

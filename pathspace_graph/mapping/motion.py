@@ -8,7 +8,7 @@ import numpy as np
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.factors.noise import KnownNoise, TwistNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, pose_key
@@ -47,12 +47,19 @@ class MeasuredMotion:
     excess: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) or (k, 3) Additional standard deviation of a twist that is extrapolated for long."""
 
-    def with_sigma(self, sigma: Array) -> Self:
-        """Integrate the motion again with other standard deviations (3,) of a twist (m/s, m/s, rad/s)."""
+    def with_noise(self, noise: TwistNoise) -> Self:
+        """Integrate the motion again with other noise of a twist."""
         if self.durations is None:
             return self
-        integrated = integrate_twists(self.durations, self.twists, np.hypot(sigma, self.excess))
-        return replace(self, odometry=integrated)
+        sigmas = np.hypot(noise.sigmas(self.durations), self.excess)
+        return replace(self, odometry=integrate_twists(self.durations, self.twists, sigmas))
+
+    def with_missed(self, sigmas: Array, noise: TwistNoise) -> Self:
+        """Add the standard deviations (3,) of a motion that the twists have missed (m, m, rad)."""
+        if self.durations is None or not self.durations.any():
+            return self
+        excess = np.hypot(self.excess, sigmas / float(np.linalg.norm(self.durations)))
+        return replace(self, excess=excess).with_noise(noise)
 
     @property
     def rests(self) -> bool:
@@ -91,12 +98,10 @@ def _positive_sigmas(values: Any) -> Array:
     return sigmas
 
 
-def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:
-    """Integrate twists, each constant until the next one, and the last one until a stamp (s).
-
-    sigma, (3,) or (k, 3), is the standard deviation of one measured twist (m/s, m/s, rad/s).
-    """
-    return integrate_twists(np.diff(np.append(odometry.t, until)), odometry.twist, sigma)
+def integrate_odometry(odometry: Odometry, until: float, noise: TwistNoise) -> IntegratedOdometry:
+    """Integrate twists, each constant until the next one, and the last one until a stamp (s)."""
+    durations = np.diff(np.append(odometry.t, until))
+    return integrate_twists(durations, odometry.twist, noise.sigmas(durations))
 
 
 def predict(smoother: FixedLagSmoother[MapRows], path: DrivenPath, motion: MeasuredMotion, t: float) -> None:

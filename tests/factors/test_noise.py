@@ -11,6 +11,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import (
     MeasuredNoise,
     RayNoise,
+    TwistNoise,
     huber_loss,
     huber_roots,
     huber_weights,
@@ -120,9 +121,20 @@ def test_a_detection_at_the_sensor_itself_has_a_covariance_and_unknown_noise_has
 def test_a_twist_with_the_noise_of_both_parts_drifts_like_them_together() -> None:
     """At rest, 250 twists of 0.04 s: `T (sigma^2 dt + drift^2)` in each direction."""
     noise = measured_noise()
-    walked = integrate_twists(np.full(250, 0.04), np.zeros((250, 3)), noise.twist_sigma).covariance
-    expected = 10.0 * (np.array([0.1, 0.05, 0.01]) ** 2 * 0.04 + np.array([0.02, 0.01, 0.003]) ** 2)
-    np.testing.assert_allclose(np.diag(walked), expected, rtol=1e-9)
+    durations, expected = np.full(250, 0.04), 10.0 * np.array([0.02, 0.01, 0.003]) ** 2
+    expected += 10.0 * np.array([0.1, 0.05, 0.01]) ** 2 * 0.04
+    for sigmas in (noise.twist_sigma, noise.twist.sigmas(durations)):
+        walked = integrate_twists(durations, np.zeros((250, 3)), sigmas).covariance
+        np.testing.assert_allclose(np.diag(walked), expected, rtol=1e-9)
+
+
+def test_the_drift_of_a_twist_depends_on_time_and_not_on_the_rate() -> None:
+    noise = TwistNoise(np.zeros(3), np.array([0.02, 0.01, 0.003]))
+    for durations in (np.full(5, 0.2), np.full(50, 0.02), np.array([0.0, 0.1, 0.9])):
+        twists = np.zeros((len(durations), 3))
+        walked = integrate_twists(durations, twists, noise.sigmas(durations)).covariance
+        np.testing.assert_allclose(np.diag(walked), noise.drift**2, rtol=1e-6)
+    np.testing.assert_allclose(noise.of_mean(7, 4.0), 0.5 * noise.drift)
 
 
 def test_detections_without_the_constant_errors_of_the_sensor_by_hand() -> None:

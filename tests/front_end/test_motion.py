@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.factors.se2 import relative
 from pathspace_graph.front_end import scan_matching
 from pathspace_graph.front_end.motion import MotionCheck
@@ -37,7 +38,7 @@ def log() -> Log:
 
 
 def checked(log: Log, settings: MotionSettings | None = None) -> list[MeasuredMotion]:
-    check = MotionCheck(log.odometry_sigma, settings or MotionSettings())
+    check = MotionCheck(TwistNoise(log.odometry_sigma), settings or MotionSettings())
     return [check.update(odometry, cycle) for odometry, cycle in split_odometry(log)]
 
 
@@ -135,7 +136,7 @@ def test_a_gap_is_filled_by_the_detections(log: Log) -> None:
 
 def test_a_gap_without_detections_is_as_uncertain_as_it_is_long() -> None:
     """A straight drive with odometry until 1 s and none afterwards: it is held, and its variance grows."""
-    check = MotionCheck(np.array([0.1, 0.1, 0.01]), MotionSettings())
+    check = MotionCheck(TwistNoise(np.array([0.1, 0.1, 0.01])), MotionSettings())
     nothing = np.zeros((0, 2))
     spreads, held = [], np.zeros(3)
     for k in range(20):
@@ -157,7 +158,7 @@ def test_readings_that_never_change_are_believed_if_the_detections_agree() -> No
     """An exact drive at constant speed has the same twist in each row."""
     cones = np.array([[x, side] for x in np.arange(0.0, 60.0, 4.0) for side in (-2.0, 2.0)])
     check, twist = (
-        MotionCheck(np.array([0.1, 0.1, 0.01]), MotionSettings()),
+        MotionCheck(TwistNoise(np.array([0.1, 0.1, 0.01])), MotionSettings()),
         np.tile([5.0, 0.0, 0.0], (10, 1)),
     )
     for k in range(40):
@@ -174,7 +175,7 @@ def past_cones(variance: float) -> tuple[MotionCheck, list[MeasuredMotion]]:
     rng, place, motions = np.random.default_rng(0), 0.0, []
     cones = np.array([[x, side] for x in np.arange(0.0, 40.0, 3.0) for side in (-2.0, 2.5)])
     cones += rng.uniform(-0.8, 0.8, cones.shape)
-    check = MotionCheck(np.array([0.1, 0.1, 0.01]), MotionSettings())
+    check = MotionCheck(TwistNoise(np.array([0.1, 0.1, 0.01])), MotionSettings())
     for k in range(40):
         speed, slip = 5.0 + np.sin(0.5 * k), 2.5 if 20 <= k < 25 else 1.0
         place += 0.1 * speed
@@ -214,7 +215,7 @@ def with_slip(seed: int, begins: float) -> tuple[list[MeasuredMotion], Array]:
     rng, place, motions = np.random.default_rng(seed), 0.0, []
     cones = np.array([[x, side] for x in np.arange(0.0, 40.0, 3.0) for side in (-2.0, 2.5)])
     cones += rng.uniform(-0.8, 0.8, cones.shape)
-    check = MotionCheck(np.array([0.1, 0.1, 0.01]), MotionSettings())
+    check = MotionCheck(TwistNoise(np.array([0.1, 0.1, 0.01])), MotionSettings())
     steps = 0.5 + 0.1 * np.sin(np.arange(24) / 2.0)
     for k, step in enumerate(steps):
         place += step
@@ -260,7 +261,7 @@ def is_doubted_again(first: float, later: int) -> bool:
     rng, place, doubted = np.random.default_rng(0), 0.0, []
     cones = np.array([[x, side] for x in np.arange(0.0, 100.0, 3.0) for side in (-2.0, 2.5)])
     cones += rng.uniform(-0.8, 0.8, cones.shape)
-    check = MotionCheck(np.array([0.1, 0.1, 0.01]), MotionSettings())
+    check = MotionCheck(TwistNoise(np.array([0.1, 0.1, 0.01])), MotionSettings())
     for k in range(17 + later):
         step = 0.5 + 0.1 * np.sin(k / 2.0)
         place += step

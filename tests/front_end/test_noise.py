@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
+from pathspace_graph.factors.noise import ASSUMED_DRIFT, KnownNoise, MeasuredNoise, RayNoise
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log, measure_log
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.io.log import Log
@@ -69,7 +69,9 @@ def test_noise_is_measured_where_nobody_has_stated_it_or_where_that_is_asked_for
 ) -> None:
     known = learner(noise(), odometry, cones, use)
     assert (known.of_odometry, known.of_detections) == measured
-    np.testing.assert_array_equal(known.twist_sigma, noise().twist_sigma if measured[0] else STATED)
+    np.testing.assert_array_equal(known.twist.white, noise().odometry if measured[0] else STATED)
+    drift = noise().drift if measured[0] else ASSUMED_DRIFT if odometry else np.zeros(3)
+    np.testing.assert_array_equal(known.twist.drift, drift)
     seen = detections(0.0, np.array([[10.0, 2.0]]), np.zeros(1, np.intp))
     expected = noise().covariances(seen.points_vehicle, inflated=True)
     if use == "stated":
@@ -112,7 +114,7 @@ def test_for_comparisons_detections_are_single_and_without_constant_errors() -> 
 def test_what_is_not_measured_yet_is_assumed() -> None:
     known = learner(None)
     assert known.is_learning and not known.is_settled
-    np.testing.assert_array_equal(known.twist_sigma, STATED)
+    np.testing.assert_array_equal(known.twist.white, STATED)
     seen = detections(0.0, np.array([[10.0, 2.0]]), np.zeros(1, np.intp))
     assert known.for_map(seen) is seen
     assert known.calibrated(SETTINGS) is SETTINGS
@@ -136,7 +138,7 @@ SMALL = 3.0 * np.hypot(SIGMA, PRIORS)
 def test_settings_stay_where_no_prior_is_contradicted(entry: int, sign: float) -> None:
     errors = np.zeros(5)
     errors[entry] = sign * SMALL[entry]
-    assert learner(noise(errors)).calibrated(SETTINGS) is SETTINGS
+    assert learner(noise(errors), cones=True).calibrated(SETTINGS) is SETTINGS
     errors[entry] *= 5.0 / 3.0
     assert learner(noise(errors)).calibrated(SETTINGS) is not SETTINGS
     assert learner(noise(errors), cones=True).calibrated(SETTINGS) is not SETTINGS
@@ -148,8 +150,40 @@ def test_settings_stay_where_no_prior_is_contradicted(entry: int, sign: float) -
 def test_an_error_that_is_known_already_contradicts_nothing() -> None:
     known = CalibrationSettings(yaw=0.05, range_scale=0.08)
     settings = replace(SETTINGS, calibration=known)
-    assert learner(noise(np.array([0.05, 0.0, 0.0, 0.08, 0.0]))).calibrated(settings) is settings
-    assert learner(noise()).calibrated(settings) is not settings
+    errors = np.array([0.05, 0.0, 0.0, 0.08, 0.0])
+    assert learner(noise(errors), cones=True).calibrated(settings) is settings
+    assert learner(noise(), cones=True).calibrated(settings) is not settings
+
+
+@pytest.mark.parametrize(
+    ("stated", "sigma", "errors", "bend", "known"),
+    [
+        (True, None, [0.05, 0.3, 0.1, 0.0, 0.0], 0.0, True),  # what is contradicted is the mounting
+        (True, None, [0.0, 0.0, 0.0, 0.0, 0.2], 0.0, False),
+        (True, 0.0005, [0.0, 0.0, 0.0, 0.0, 0.2], 0.0, True),
+        (True, 0.0005, [0.05, 0.0, 0.0, 0.08, 0.0], 0.0, False),
+        (True, 0.0005, [0.05, 0.0, 0.0, 0.0, 0.0], 0.004, False),
+        (False, None, [0.0, 0.0, 0.0, 0.0, 0.0], 0.0, False),  # a sensor of which nobody knows anything
+        (False, 0.0005, [0.05, 0.0, 0.0, 0.0, 0.0], 0.0, True),
+    ],
+)
+def test_the_ranges_keep_their_scale_as_long_as_it_is_known(
+    stated: bool, sigma: float | None, errors: list[float], bend: float, known: bool
+) -> None:
+    measured = replace(noise(np.array(errors)), range_bend=bend)
+    own = learner(measured, cones=stated)
+    own.known = replace(own.known, sigma_range_scale=sigma)
+    found = own.calibrated(SETTINGS)
+    assert found.odometry.hold_scale != known
+    before = SETTINGS.calibration
+    kept = (found.calibration.range_scale, found.calibration.sigma_range_scale)
+    assert (kept == (before.range_scale, before.sigma_range_scale)) == known
+
+
+def test_a_stated_scale_of_the_ranges_is_the_prior_from_the_first_cycle() -> None:
+    own = learner(None)
+    own.known = replace(own.known, sigma_range_scale=0.01)
+    assert own.calibrated(SETTINGS).calibration == replace(SETTINGS.calibration, sigma_range_scale=0.01)
 
 
 ERRORS = np.array([0.05, -0.3, 0.1, 0.08, 0.2])

@@ -9,6 +9,7 @@ import pytest
 
 from pathspace_graph.baselines.filters import CkfMapper
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
+from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import half_square, mean_bias
 from pathspace_graph.front_end.motion import MotionCheck, Rest
@@ -45,7 +46,7 @@ def log() -> Log:
 
 
 def test_the_bias_is_measured_and_the_vehicle_does_not_move(log: Log) -> None:
-    check = MotionCheck(log.odometry_sigma, MotionSettings())
+    check = MotionCheck(TwistNoise(log.odometry_sigma), MotionSettings())
     motions = [check.update(odometry, cycle) for odometry, cycle in split_odometry(log)]
     measured = mean_bias([motion.bias for motion in motions if motion.bias])
     assert measured is not None
@@ -109,7 +110,7 @@ def test_a_vehicle_that_creeps_is_not_at_rest() -> None:
     for k in range(40):
         t = 0.1 * k + 0.02 * np.arange(5)
         twist = np.array([0.3, 0.0, 0.0]) + SIGMA * rng.standard_normal((5, 3))
-        told.append(rest.update(Odometry(t, twist), 0.1 * (k + 1), SIGMA))
+        told.append(rest.update(Odometry(t, twist), 0.1 * (k + 1), TwistNoise(SIGMA)))
     assert not any(told[12:])
 
 
@@ -120,7 +121,7 @@ def test_detections_that_move_past_deny_a_rest(log: Log) -> None:
     twist = sliding.odometry.twist.copy()
     rng = np.random.default_rng(1)
     twist[:] = SIGMA * rng.standard_normal(twist.shape)
-    check = MotionCheck(sliding.odometry_sigma, MotionSettings())
+    check = MotionCheck(TwistNoise(sliding.odometry_sigma), MotionSettings())
     wrong = replace(sliding, odometry=Odometry(sliding.odometry.t, twist))
     motions = [check.update(odometry, cycle) for odometry, cycle in split_odometry(wrong)]
     assert not any(motion.bias for motion in motions)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.factors.se2 import relative, to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end import scan_matching
@@ -135,7 +136,7 @@ def test_a_drive_shows_the_errors_of_its_sensor(
     faults: dict[str, float], expected: tuple[float, float]
 ) -> None:
     log = drive(**faults)
-    check = MotionCheck(log.odometry_sigma, SETTINGS)
+    check = MotionCheck(TwistNoise(log.odometry_sigma), SETTINGS)
     for odometry, cycle in split_odometry(log):
         check.update(odometry, cycle)
     assert (np.sqrt(np.diag(check.errors.covariance)) < 0.2 * np.array(SIGMAS_ERRORS)).all()

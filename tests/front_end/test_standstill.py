@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.front_end.motion import MotionCheck
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT
@@ -57,7 +58,7 @@ def motions(
     """Motions of a drive along x by true and told speeds (k,), one a cycle; a tenth of the cones is lost."""
     rng = np.random.default_rng(seed)
     cones = rows(rng) if cones is None else cones
-    check = check or MotionCheck(TWIST_SIGMA, MotionSettings())
+    check = check or MotionCheck(TwistNoise(TWIST_SIGMA), MotionSettings())
     found, place = [], 0.0
     for k, (speed, reading) in enumerate(zip(true, told, strict=True)):
         t = PERIOD * (k + 1)
@@ -146,7 +147,7 @@ def test_between_walls_there_is_no_decision() -> None:
     """Points of two straight walls, at other places in each cycle, show nothing of a motion along them."""
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
-        check = MotionCheck(TWIST_SIGMA, MotionSettings())
+        check = MotionCheck(TwistNoise(TWIST_SIGMA), MotionSettings())
         found = []
         for k in range(40):
             t = PERIOD * (k + 1)
@@ -167,14 +168,14 @@ def test_two_cones_decide_nothing() -> None:
 def test_detections_before_other_noise_are_not_compared() -> None:
     """With the noise, the corrections of the detections change, here by a scale of 10 %."""
     for seed in SEEDS:
-        check = MotionCheck(TWIST_SIGMA, MotionSettings())
+        check = MotionCheck(TwistNoise(TWIST_SIGMA), MotionSettings())
         cones, true = rows(np.random.default_rng(seed)), np.full(20, 0.5)
         motions(true, true, seed, cones, check=check)
-        check.set_noise(TWIST_SIGMA)
+        check.set_noise(TwistNoise(TWIST_SIGMA))
         later = motions(true, true, seed + 100, 1.1 * cones, check=check)
         assert not any(is_rest(motion) for motion in later)
 
 
 def test_an_odometry_that_is_always_believed_is_believed_here() -> None:
-    true, check = np.zeros(20), MotionCheck(TWIST_SIGMA, MotionSettings(doubt=np.inf))
+    true, check = np.zeros(20), MotionCheck(TwistNoise(TWIST_SIGMA), MotionSettings(doubt=np.inf))
     assert not any(motion.fault for motion in motions(true, true + 1.3, 0, check=check))
