@@ -159,23 +159,14 @@ class Scatter:
         return np.asarray(self.sigma(label, u) / np.sqrt((basis**2).sum(axis=1)))
 
 
-def scatter_about(
-    state: State, optimum: State, detections: DetectionTable, settings: MapperSettings
-) -> Scatter:
+def scatter_about(state: State, detections: DetectionTable, settings: MapperSettings) -> Scatter:
     """Compute the scatter of the detected cones about the curves of the state.
 
-    For a line, it is the scatter of the optimum's curve, which follows the line everywhere.
+    A line has points in place of cones (`association:points_along`), and none in a gap.
     """
     seen, unseen, places, lengths = [], [], {}, {}
     for label, boundary in state.boundaries.items():
         lengths[label] = boundary.length if boundary.periodic else np.inf
-        if label in settings.lines:
-            points = sampled(optimum.spline(label), NEED_STEP)
-            foot = boundary.find_anywhere(state.control_points(label), points)
-            seen.append(foot.distance)
-            unseen.append(foot.distance)
-            places[label] = foot.u
-            continue
         cones = cones_of_curve(state, detections, label, settings)
         foot, share = feet_of_cones(state, cones, label), boundary.size / max(len(cones.u), 1)
         seen.append(foot.distance)
@@ -235,7 +226,7 @@ def simplified(state: State, detections: DetectionTable, settings: MapperSetting
     detections = detections.copy()
     locate_poses(few)
     associate(few, detections, settings, settings.batch.gate, strict=True)
-    return Simplified(few, change, detections, scatter_about(few, state, detections, settings))
+    return Simplified(few, change, detections, scatter_about(few, detections, settings))
 
 
 def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:
