@@ -39,7 +39,8 @@ def compare_command(options: Compare) -> Outcome:
         return compare_maps(*options.log, options.out)
     if len(options.log) != 1:
         raise SettingsError(f"LOG: expected one log, or two maps, found {len(options.log)} folders")
-    plan = experiment.plan_of(options.log[0], options.estimators, options.settings, options.own)
+    own = options.own(options.estimators)
+    plan = experiment.plan_of(options.log[0], options.estimators, options.settings, own)
     check_jobs(options.jobs)
     check_target(options.out, experiment.MARKER)
     for drive in dict.fromkeys(cell.drive for cell in plan.cells):

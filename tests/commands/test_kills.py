@@ -11,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.cli import parse_command, run_command
+from pathspace_graph.cli import parse, run_command
 from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.metrics.measures import Row
 from pathspace_graph.eval.metrics.summary import versions
@@ -152,7 +152,7 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     if name == "faults":
         drives = ["--tracks", str(track), "--seeds", "0", "--laps", "1", "--jobs", "1"]
         options = [*drives, "--only", "no colours", "--quick", "--estimator", "rings"]
-    command = parse_command(name, [*options, "--out", str(folder / "out")])
+    _, command = parse([name, *options, "--out", str(folder / "out")])
 
     def work() -> None:
         assert run_command(name, command) == 0
