@@ -48,7 +48,6 @@ GROUPS: Final = {
     "Data": {
         "simulate": Command("data:Simulate", "simulate", "Write the log of a simulated drive, with truth."),
         "convert": Command("data:Convert", "convert", "Write a ROS bag, CSV files or JSON lines as a log."),
-        "verify": Command("data:Verify", "plot", "Check that files are as they were written."),
     },
     "Studies": {
         "compare": Command("study:Compare", "compare", "Run every estimator on logs: the paper's table."),

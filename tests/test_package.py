@@ -107,7 +107,7 @@ def test_the_command_line_starts_without_the_heavy_libraries() -> None:
 def test_help_waits_for_no_heavy_library(command: str) -> None:
     loaded = modules_after(f"from pathspace_graph.cli import main; main(['{command}', '--help'])")
     assert not loaded & {"gtsam", "matplotlib", "pandas", "joblib", "scipy.linalg", "scipy.spatial"}
-    assert ("numpy" in loaded) == (command in ("simulate", "convert", "verify"))
+    assert ("numpy" in loaded) == (command in ("simulate", "convert"))
 
 
 def test_the_version_names_gtsam_and_the_kernels(capsys: pytest.CaptureFixture[str]) -> None:

@@ -36,20 +36,20 @@ PICTURE_DPI: Final = 150.0  # resolution of the picture, dots per inch, which su
 
 def compare_command(options: Compare) -> Outcome:
     if len(options.log) == 2:
-        return compare_maps(*options.log, options.out)
+        return compare_maps(*options.log, options.out, force=options.force)
     if len(options.log) != 1:
         raise SettingsError(f"LOG: expected one log, or two maps, found {len(options.log)} folders")
     own = options.own(options.estimators)
     plan = experiment.plan_of(options.log[0], options.estimators, options.settings, own)
     check_jobs(options.jobs)
-    check_target(options.out, experiment.MARKER)
+    check_target(options.out, experiment.MARKER, force=options.force)
     for drive in dict.fromkeys(cell.drive for cell in plan.cells):
         tell(drive.load()[1], of=drive.source if len(plan.study.logs) > 1 else "")
     with unfinished(options.out) as folder:
         with progress("comparing", lines=LINES) as advance:
             comparison = compare(plan, folder, jobs=options.jobs, on_cell=advance)
         with progress("writing"):
-            experiment.write_comparison(options.out, comparison, options.jobs)
+            experiment.write_comparison(options.out, comparison, options.jobs, force=options.force)
     return report(options.out, comparison)
 
 
@@ -71,7 +71,7 @@ def _name(names: Mapping[str, str]) -> str:
 
 
 def demo_command(options: Demo) -> Outcome:
-    check_target(options.out, PICTURE)
+    check_target(options.out, PICTURE, force=True)
     with progress("driving"):
         log = simulate(generated_track(options.seed), SimulationSettings(laps=options.laps), options.seed)
     say(f"a generated track, {options.laps} times around: {describe(log)}")
@@ -97,7 +97,7 @@ def map_with_both(log: Log, settings: MapperSettings) -> tuple[RunResult, RunRes
 
 def write_demo(out: Path, log: Log, result: RunResult) -> None:
     """Write the log, the map and its picture: all of them, or on failure nothing."""
-    with progress("writing"), atomic_folder(out, PICTURE) as folder:
+    with progress("writing"), atomic_folder(out, PICTURE, force=True) as folder:
         write_log(log, folder / "log")
         write_result(folder / "map", result, summarize(result, log))
         picture = plot_map(result.map, log=log, trajectory=result.trajectory, smoothed=result.smoothed)

@@ -73,7 +73,7 @@ def online_command(options: Online) -> Outcome:
         differ = [] if known is None else known.differences(result, estimator)
         summarized = summarize(result, log, hints)
         summarized |= {} if known is None else known.summary(estimator, differ)
-        write_result(options.out, result, summarized)
+        write_result(options.out, result, summarized, force=options.force)
     if options.save is not None and isinstance(estimator, FixedLagMapper):
         estimator.save(options.save)
     if options.plot is not None:
@@ -102,7 +102,7 @@ def viewers(options: Online) -> Any:
 def check_online_options(options: Online) -> None:
     """Raise an error where options contradict each other, before anything is mapped."""
     estimators.check_online(options.estimator)
-    check_target(options.out, MAP_FILE)
+    check_target(options.out, MAP_FILE, force=options.force)
     for name in ("save", "resume"):
         if getattr(options, name) is not None and options.estimator != DEFAULT_ONLINE:
             raise SettingsError(f"--{name}: expected --estimator {DEFAULT_ONLINE}, found {options.estimator}")
@@ -163,7 +163,7 @@ def batch_command(options: Batch) -> Outcome:
     estimators.check_batch(options.estimator)
     if options.start == "odometry" and options.estimator != DEFAULT_BATCH:
         raise SettingsError(f"--start: expected online for {options.estimator}, found {options.start}")
-    check_target(options.out, MAP_FILE)
+    check_target(options.out, MAP_FILE, force=options.force)
     parameters = own_parameters(options)
     if len(options.log) > 1:
         return batch_of_several(options)
@@ -175,7 +175,7 @@ def batch_command(options: Batch) -> Outcome:
         solved = with_own(estimator.solve(log, *more), parameters)
         result: BatchRun = of_kind(solved, options.map, options.settings)
     summarized = summarize_batch(result, log, hints)
-    write_result(options.out, result, summarized)
+    write_result(options.out, result, summarized, force=options.force)
     report(result, log)
     return Outcome([options.out], summarized, untrusted(result))
 
@@ -194,7 +194,7 @@ def batch_of_several(options: Batch) -> Outcome:
     name, result = next(iter(joint.drives.items()))
     result = of_kind(result, options.map, options.settings)
     summarized = summarize_batch(result, logs[name], hints[name]) | summary_of_drives(joint, logs)
-    write_result(options.out, result, summarized, joint.drives)
+    write_result(options.out, result, summarized, joint.drives, force=options.force)
     report(result, logs[name])
     say(*drive_lines(joint))
     left_out = [f"{name} is left out: {why}" for name, why in joint.left_out.items()]

@@ -21,13 +21,13 @@ PICTURE: Final = "apart.png"
 STATISTICS: Final = ("mean", "rms", "p95", "max")
 
 
-def compare_maps(first: Path, second: Path, out: Path) -> Outcome:
+def compare_maps(first: Path, second: Path, out: Path, *, force: bool) -> Outcome:
     """Align the first map with the second, print and write their distances, and draw both."""
-    check_target(out, APART_FILE)
+    check_target(out, APART_FILE, force=force)
     tracks = read_map(first), read_map(second)
     apart = maps_apart(*tracks)
     content = {"maps": [str(first), str(second)], **apart.to_json()}
-    with atomic_folder(out, APART_FILE) as folder:
+    with atomic_folder(out, APART_FILE, force=force) as folder:
         write_json(folder / APART_FILE, content)
         save_plot(plot_apart(*tracks, apart), folder / PICTURE)
     output().print(apart_table(apart))

@@ -13,7 +13,7 @@ FILE: Final = Parameter(allow_leading_hyphen=True)
 _EVERY: Final = Parameter(negative=(), group=Group("Every command", sort_key=3))
 
 
-def known(*names: str) -> Parameter:
+def suggest(*names: str) -> Parameter:
     """Complete these names in a shell; others are accepted too, such as estimators of other packages."""
     return Parameter(completer=lambda _: names)
 
@@ -28,3 +28,11 @@ class Command:
     """Print progress in lines, and where an error comes from."""
     json: Annotated[bool, _EVERY] = False
     """Print the result as JSON."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FolderCommand(Command):
+    """Options of a command that writes one folder."""
+
+    force: Annotated[bool, Parameter(negative=())] = False
+    """Replace an earlier result in the folder."""

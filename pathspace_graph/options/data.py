@@ -1,4 +1,4 @@
-"""`simulate`, `convert` and `verify`: sources of logs, and the check of written files."""
+"""`simulate` and `convert`: sources of logs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,15 +11,15 @@ from pathspace_graph.convert.settings import BagOptions, Frames, NoiseSettings, 
 from pathspace_graph.sim.simulate import PRESETS, SimulationSettings, preset
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings
 
-from .command import INLINE, Command
+from .command import INLINE, FolderCommand
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulate(Command):
+class Simulate(FolderCommand):
     """Drive a track and write the log of it, with truth; a seed gives the same log to the byte."""
 
     out: Path
-    """Folder for the log; an earlier log there is kept as a numbered backup."""
+    """Folder for the log."""
     track: Path | None = None
     """Track file: PacSim or fssim YAML, EUFS or TUM CSV."""
     generate: int | None = None
@@ -46,7 +46,7 @@ class Simulate(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Convert(Command):
+class Convert(FolderCommand):
     """Write a ROS bag, CSV files or JSON lines as a log, and report what was dropped.
 
     A log is in order of time and in the vehicle frame. A folder of several records becomes a folder of logs.
@@ -56,7 +56,7 @@ class Convert(Command):
     """Bag (a file, or a folder with metadata.yaml), folder of CSV files, file of JSON lines, or a folder of
     several of these."""
     out: Path
-    """Folder of the log; an earlier log there is kept as a numbered backup."""
+    """Folder for the log."""
     kind: Annotated[Literal["bag", "csv", "jsonl"], Parameter(name="--from")] = "bag"
     """Kind of the record."""
     topics: Annotated[BagOptions, INLINE] = field(default_factory=BagOptions)
@@ -79,11 +79,3 @@ class Convert(Command):
     """Part of the record to convert."""
     noise: Annotated[NoiseSettings, INLINE] = field(default_factory=NoiseSettings)
     """Noise that the record does not state."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Verify(Command):
-    """Check every file of a folder against its manifest, which each command writes beside its files."""
-
-    folder: Path = field(kw_only=False)
-    """Folder of a log, a map, or the result of another command, with its subfolders."""

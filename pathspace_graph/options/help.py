@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING, Final
 
-from attrs import evolve
 from cyclopts.help.formatters import DefaultFormatter
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ class Help(DefaultFormatter):
                 hidden[f"{name.split('.')[0]}.*"] = None
             else:
                 text = " ".join(entry.description.primary_renderable.plain.split())
-                shown.append(evolve(entry, description=text.split(". ")[0] if self.short else text))
+                shown.append(entry.copy(description=text.split(". ")[0] if self.short else text))
         super().__call__(console, options, panel.copy(entries=shown))
         if hidden:
             console.print(f"--help-all also explains {', '.join(hidden)}", highlight=False, markup=False)

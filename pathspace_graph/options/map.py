@@ -13,7 +13,7 @@ from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
 from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.settings.output import RecordingSettings, SpeedSettings
 
-from .command import FILE, INLINE, Command, known
+from .command import FILE, INLINE, Command, FolderCommand, suggest
 
 MapKind = Literal["boundaries", "centerline"]
 Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]
@@ -54,7 +54,7 @@ class Demo(Estimation):
     """Simulate a track and map it online: the paper's table beside the landmark graph's, and a picture."""
 
     out: Path = Path("pathspace-demo")
-    """Folder for log, map and picture; an earlier demo there is kept as a numbered backup."""
+    """Folder for log, map and picture, in the place of an earlier demo."""
     seed: int = 8
     """Seed of the track and of all noise; by default one whose first lap is typical."""
     laps: int = 5
@@ -62,14 +62,14 @@ class Demo(Estimation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Online(Checked, Estimation, group=""):
+class Online(Checked, Estimation, FolderCommand, group=""):
     """Map a log online, cycle by cycle, and write the map, the trajectory, the cycles and a summary."""
 
     log: Path = field(kw_only=False)
     """Folder of the log."""
     out: Path
-    """Folder for the map; an earlier map there is kept as a numbered backup."""
-    estimator: Annotated[str, known(*ONLINE_NAMES)] = ONLINE_NAMES[0]
+    """Folder for the map."""
+    estimator: Annotated[str, suggest(*ONLINE_NAMES)] = ONLINE_NAMES[0]
     """Name of the online estimator."""
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
@@ -86,16 +86,16 @@ class Online(Checked, Estimation, group=""):
     resume: Path | None = None
     """File of a saved mapper, which continues with its own settings and with cycles after its newest."""
     plot: Annotated[Path | None, FILE] = None
-    """File for a picture of the map (.png, .pdf or .svg); an earlier one is kept as a numbered backup."""
+    """File for a picture of the map (.png, .pdf or .svg)."""
     view: bool = False
     """Show the run in the live viewer rerun."""
     save_view: Annotated[Path | None, FILE] = None
-    """File (.rrd) for what the viewer shows; an earlier one is kept as a numbered backup."""
+    """File (.rrd) for what the viewer shows."""
     recording: RecordingSettings = field(default_factory=RecordingSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Batch(Estimation):
+class Batch(Estimation, FolderCommand):
     """Optimize whole logs at once, and write the map, the trajectory, the cycles and a summary.
 
     Several logs of one track give one map, in the frame of the first, and a trajectory for each. A drive that
@@ -105,8 +105,8 @@ class Batch(Estimation):
     log: tuple[Path, ...] = field(kw_only=False)
     """Folder of the log, or folders of several drives of one track."""
     out: Path
-    """Folder for the map; an earlier map there is kept as a numbered backup."""
-    estimator: Annotated[str, known(*BATCH_NAMES)] = BATCH_NAMES[0]
+    """Folder for the map."""
+    estimator: Annotated[str, suggest(*BATCH_NAMES)] = BATCH_NAMES[0]
     """Name of the batch estimator."""
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
@@ -121,7 +121,7 @@ class Plot(Checked, Command, group=""):
     map: Path = field(kw_only=False)
     """Folder of the map."""
     out: Annotated[Path, FILE]
-    """File for the picture (.png, .pdf or .svg); an earlier one is kept as a numbered backup."""
+    """File for the picture (.png, .pdf or .svg), or standard output (`-`)."""
     log: Path | None = None
     """Folder of the log whose truth is drawn as well."""
     band_scale: float = 1.0
@@ -142,7 +142,7 @@ class Export(Command):
     columns x, y and label (`points`), both boundaries with lanelets as OSM XML (`lanelet2`), or the centre
     line with the speed that friction and curvature allow as CSV (`profile`)."""
     out: Annotated[Path, FILE]
-    """File for the result, or standard output (`-`); an earlier file is kept as a numbered backup."""
+    """File for the result, or standard output (`-`)."""
     step: float = 1.0
     """Distance of the points along a curve (m)."""
     origin: tuple[float, float, float] | None = None

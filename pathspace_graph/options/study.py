@@ -7,7 +7,7 @@ from typing import Annotated
 from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
 from pathspace_graph.settings.evaluation import ScalingSettings
 
-from .command import Command, known
+from .command import Command, FolderCommand, suggest
 from .map import Estimation
 
 EVERY = (*ONLINE_NAMES, *BATCH_NAMES)
@@ -15,7 +15,7 @@ STUDIES = tuple(sorted(file.stem for file in (Path(__file__).parents[1] / "eval"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(Estimation):
+class Compare(Estimation, FolderCommand):
     """Run every estimator on a log or a folder of logs; or compare two maps.
 
     Of logs, tables, figures and all maps are written; of two maps, their distances and a picture.
@@ -29,8 +29,8 @@ class Compare(Estimation):
     log: tuple[Path, ...] = field(kw_only=False)
     """Folder of the log, or of several logs; or the folders of two maps of one track."""
     out: Path
-    """Folder for tables, figures and maps; an earlier comparison there is kept as a numbered backup."""
-    estimators: Annotated[tuple[str, ...], known(*EVERY)] = ()
+    """Folder for tables, figures and maps."""
+    estimators: Annotated[tuple[str, ...], suggest(*EVERY)] = ()
     """Names of the estimators, online and batch ones; by default all."""
     jobs: int = 1
     """Number of runs at a time, -1 for one on each core; times of updates are comparable with 1 only."""
@@ -64,7 +64,7 @@ class StudyCommand(Command):
 class Ablate(StudyCommand):
     """Run a study, or what remains of it, and write its results, its summary and its figures."""
 
-    study: Annotated[Path, known(*STUDIES)] = field(kw_only=False)
+    study: Annotated[Path, suggest(*STUDIES)] = field(kw_only=False)
     """TOML file of the study, or name of one that comes with the package."""
     baseline: str | None = None
     """Variant or estimator that the others are compared with, in place of the study's own; a finished study
@@ -79,7 +79,7 @@ class FaultSuite(StudyCommand):
     with the same seed.
     """
 
-    estimator: Annotated[str, known(*EVERY)] = ONLINE_NAMES[0]
+    estimator: Annotated[str, suggest(*EVERY)] = ONLINE_NAMES[0]
     """Name of the estimator, an online or a batch one."""
     only: tuple[str, ...] = ()
     """Names of the faults to run, as in the table."""
@@ -88,7 +88,7 @@ class FaultSuite(StudyCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scale(Estimation):
+class Scale(Estimation, FolderCommand):
     """Time every online estimator on ever larger maps and more and more detections, and draw the slopes.
 
     All run in this one process, cycle for cycle in turn, so that other work of the machine slows all of them
@@ -99,8 +99,8 @@ class Scale(Estimation):
     """
 
     out: Path
-    """Folder for points, slopes and figures; earlier ones there are kept as a numbered backup."""
-    estimators: Annotated[tuple[str, ...], known(*ONLINE_NAMES)] = ()
+    """Folder for points, slopes and figures."""
+    estimators: Annotated[tuple[str, ...], suggest(*ONLINE_NAMES)] = ()
     """Names of the online estimators; by default all."""
     quick: bool = False
     """Take less than a minute, with small maps and few laps, to see that everything works. It excludes all

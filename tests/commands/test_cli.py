@@ -123,7 +123,7 @@ def test_settings_of_the_simulator_are_options(tmp_path: Path) -> None:
 
 
 def test_a_map_keeps_the_formats_contract(log_folder: Path, map_folder: Path) -> None:
-    files = {"map.json", "trajectory.tum", "smoothed.tum", "cycles.csv", "summary.json", "manifest.json"}
+    files = {"map.json", "trajectory.tum", "smoothed.tum", "cycles.csv", "summary.json"}
     assert names(map_folder) == files
     content = json.loads((map_folder / "map.json").read_text())
     assert content["format"] == "pathspace-map/1"
@@ -308,11 +308,28 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
     monkeypatch.setattr("pathspace_graph.commands.compare.simulate", lambda *_: read_log(log_folder))
     monkeypatch.chdir(tmp_path)
     assert main(["demo"]) == 0
-    assert names(tmp_path / "pathspace-demo") == {"log", "map", "track.png", "manifest.json"}
+    (tmp_path / "pathspace-demo" / "track.png").write_text("of an earlier demo")
+    assert main(["demo"]) == 0
+    assert (tmp_path / "pathspace-demo" / "track.png").read_bytes().startswith(b"\x89PNG")
+    assert names(tmp_path / "pathspace-demo") == {"log", "map", "track.png"}
     assert read_map(tmp_path / "pathspace-demo" / "map").boundaries
     printed = capsys.readouterr().out
     assert "rmse [m]" in printed
     assert "pathspace-demo" in printed
+
+
+def test_an_earlier_result_is_replaced_by_force_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert simulate(tmp_path / "log") == 0
+    before = contents(tmp_path / "log")
+    assert simulate(tmp_path / "log", "--seed", "1") == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1 and f"{tmp_path / 'log'}: expected no earlier result" in line
+    assert contents(tmp_path / "log") == before
+    assert simulate(tmp_path / "log", "--seed", "1", "--force") == 0
+    assert contents(tmp_path / "log") != before
+    assert names(tmp_path) == {"log"}
 
 
 # --- usage -----------------------------------------------------------------------------------------------
@@ -361,7 +378,7 @@ def test_help_explains_the_command(command: str, capsys: pytest.CaptureFixture[s
         assert main(words) == 0
         shown = capsys.readouterr().out
         assert shown.startswith(f"Usage: pathspace-graph {command} ")
-        assert "--out" in shown or command == "verify"
+        assert "--out" in shown
         assert "Print the result as JSON" in shown
 
 

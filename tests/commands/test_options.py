@@ -220,7 +220,7 @@ def test_the_shell_completes_commands_options_and_values(
     assert completed("on") == ["online"]
     assert completed("batch", "MAP", "--spline.deg") == ["--spline.degree"]
     assert completed("convert", "--fro") == ["--from", "--from-poses"]
-    assert completed("verify", "--spline") == []
+    assert completed("plot", "--spline") == []
     assert completed("export", "MAP", "--as", "la") == ["lanelet2"]
     assert completed("online", "LOG", "--estimator", "ck") == ["ckf"], "names that are no choices"
     assert completed("ablate", "degr") == ["degree"]

@@ -94,7 +94,6 @@ ablate lag --out D --tracks none.yaml | none.yaml
 faults --out D --only latenc | the nearest is 'latency of detections'
 faults --out D --estimator fixed-lagg | the nearest is 'fixed-lag'
 scale --out D --estimators foo | --estimators: expected a known online estimator
-verify | --folder requires an argument
 """
 
 
