@@ -17,11 +17,10 @@ from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import save_plot
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.io.files import atomic_folder, check_target
-from pathspace_graph.io.log import Log, write_log
-from pathspace_graph.io.results import RunResult, write_result
+from pathspace_graph.io.log import write_log
+from pathspace_graph.io.results import write_result
 from pathspace_graph.options.map import Demo
 from pathspace_graph.options.study import Compare
-from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from .estimate import map_online, outline, tell
@@ -75,30 +74,19 @@ def demo_command(options: Demo) -> Outcome:
     with progress("driving"):
         log = simulate(generated_track(options.seed), SimulationSettings(laps=options.laps), options.seed)
     say(f"a generated track, {options.laps} times around: {describe(log)}")
-    result, rival = map_with_both(log, options.settings)
-    write_demo(options.out, log, result)
+    with workers(2):  # the rival in another process; with one job it would be run here, and first
+        begun = Parallel(return_as="generator")([delayed(run_estimator)(RIVAL, options.settings, log)])
+        result = map_online(log, make_online(DEFAULT_ONLINE, options.settings, log))
+        with progress(RIVAL):
+            (rival,) = begun  # to the end, or joblib warns of tasks that were cancelled
+    with progress("writing"), atomic_folder(options.out, PICTURE, force=True) as folder:
+        write_log(log, folder / "log")
+        write_result(folder / "map", result, summarize(result, log))
+        picture = plot_map(result.map, log=log, trajectory=result.trajectory, smoothed=result.smoothed)
+        save_plot(picture, folder / PICTURE, PICTURE_DPI)
     table = side_by_side({run.estimator: laps_of(run, log) for run in (result, rival)})
     if table.rows:
         output().print(table.rich())
     say(outline(result))
     say(*not_mapped(result.map, log), f"log, map and {PICTURE}:")
     return Outcome([options.out], {"laps": table.records()})
-
-
-def map_with_both(log: Log, settings: MapperSettings) -> tuple[RunResult, RunResult]:
-    """Map with the spline graph, and with the landmark graph in another process."""
-    with workers(2):  # with one job it would be run here, and first
-        rival = Parallel(return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
-        result = map_online(log, make_online(DEFAULT_ONLINE, settings, log))
-        with progress(RIVAL):
-            (landmarks,) = rival  # to the end, or joblib warns of tasks that were cancelled
-        return result, landmarks
-
-
-def write_demo(out: Path, log: Log, result: RunResult) -> None:
-    """Write the log, the map and its picture: all of them, or on failure nothing."""
-    with progress("writing"), atomic_folder(out, PICTURE, force=True) as folder:
-        write_log(log, folder / "log")
-        write_result(folder / "map", result, summarize(result, log))
-        picture = plot_map(result.map, log=log, trajectory=result.trajectory, smoothed=result.smoothed)
-        save_plot(picture, folder / PICTURE, PICTURE_DPI)
