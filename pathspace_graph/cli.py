@@ -105,7 +105,7 @@ def parse(words: Sequence[str]) -> tuple[str, Any]:
         check_name(name, COMMANDS, f"expected a command ({', '.join(COMMANDS)})")
         words = [name, *before, *rest]
     app = application(name)
-    if not set(HELP).isdisjoint(words) or not words:
+    if name != ASK_COMPLETION and (not words or not set(HELP).isdisjoint(words)):
         app.help_formatter = import_module(".options.help", __package__).Help(short=HELP_ALL not in words)
         app.help_print([name] if name else [], console=import_module(".console", __package__).output())
         return name, None

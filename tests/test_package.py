@@ -110,6 +110,11 @@ def test_help_waits_for_no_heavy_library(command: str) -> None:
     assert ("numpy" in loaded) == (command in ("simulate", "convert"))
 
 
+def test_a_wrong_usage_waits_for_no_library_either() -> None:
+    loaded = modules_after("from pathspace_graph.cli import main; main(['online', 'LOG', '--lag', 'x'])")
+    assert not loaded & {"numpy", "gtsam", "rich", "docstring_parser"}
+
+
 def test_the_version_names_gtsam_and_the_kernels(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     built = r"(gcc \d+\.\d+|clang \d+\.\d+|MSVC \d+)"
