@@ -1,24 +1,32 @@
-"""The command line: it finds the command, and turns errors into one line and an exit code."""
+"""The command line: cyclopts reads it, and errors become one line and an exit code."""
 
 import os
+import re
 import signal
 import sys
 import threading
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib import import_module
-from importlib.metadata import version
-from multiprocessing import active_children
+from itertools import takewhile
 from traceback import print_exc
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, cast, get_args
+
+import cyclopts
+from cyclopts import App, ArgumentCollection
 
 from .errors import PathspaceError, SolveError, check_name
 
 PROGRAM: Final = "pathspace-graph"
 DONE, BAD_INPUT, NOT_SOLVED, INTERRUPTED, BROKEN_PIPE, TERMINATED = 0, 2, 3, 130, 141, 143  # exit codes
-HELP: Final = ("-h", "--help", "--help-all")
-JSON: Final = "--json"
-# options of every command, each with its level of `console.Verbosity`
-LEVELS: Final = {"-q": "QUIET", "--quiet": "QUIET", "-v": "VERBOSE", "--verbose": "VERBOSE"}
+MOST_SAID: Final = 400  # characters of a message about the command line, which may hold any word of it
+ASK_COMPLETION: Final = "__complete"  # by which a script of `--completion` asks for names
+HELP_ALL: Final = "--help-all"
+HELP: Final = ("--help", "-h", HELP_ALL)
+PARAMETER: Final = cyclopts.Parameter(
+    consume_multiple=1, negative_iterable=(), json_dict=False, json_list=False
+)
+WHOLE: Final = re.compile(r"[+-]?\d{1,18}|none", re.IGNORECASE)  # cyclopts would round any other number
 
 
 class Command(NamedTuple):
@@ -30,24 +38,23 @@ class Command(NamedTuple):
 
 
 GROUPS: Final = {
-    "maps": {
-        "demo": Command("map.Demo", "compare", "maps a generated track online: a table, a map, its picture"),
-        "online": Command("map.Online", "estimate", "maps a log online, cycle by cycle"),
-        "batch": Command("map.Batch", "estimate", "optimizes whole logs at once, as the ground reference"),
-        "plot": Command("map.Plot", "plot", "draws a map with its uncertainty band"),
-        "export": Command("map.Export", "export", "writes a map as planners and other tools read it"),
+    "Maps": {
+        "demo": Command("map:Demo", "compare", "Map a generated track online: a table, a map, its picture."),
+        "online": Command("map:Online", "estimate", "Map a log online, cycle by cycle."),
+        "batch": Command("map:Batch", "estimate", "Optimize whole logs at once, as the ground reference."),
+        "plot": Command("map:Plot", "plot", "Draw a map with its uncertainty band."),
+        "export": Command("map:Export", "export", "Write a map as planners and other tools read it."),
     },
-    "data": {
-        "simulate": Command("data.Simulate", "simulate", "writes the log of a simulated drive, with truth"),
-        "convert": Command("data.Convert", "convert", "writes a ROS bag, CSV files or JSON lines as a log"),
-        "verify": Command("data.Verify", "plot", "checks that files are as they were written"),
+    "Data": {
+        "simulate": Command("data:Simulate", "simulate", "Write the log of a simulated drive, with truth."),
+        "convert": Command("data:Convert", "convert", "Write a ROS bag, CSV files or JSON lines as a log."),
     },
-    "studies": {
-        "compare": Command("study.Compare", "compare", "runs every estimator on logs: the paper's table"),
-        "ablate": Command("study.Ablate", "studies", "runs a study of estimators and settings"),
-        "faults": Command("study.FaultSuite", "studies", "measures what each fault of a car costs"),
-        "scale": Command("study.Scale", "studies", "measures update time against map size"),
-        "report": Command("study.Report", "studies", "measures the figures of the pages"),
+    "Studies": {
+        "compare": Command("study:Compare", "compare", "Run every estimator on logs: the paper's table."),
+        "ablate": Command("study:Ablate", "studies", "Run a study of estimators and settings."),
+        "faults": Command("study:FaultSuite", "studies", "Measure what each fault of a car costs."),
+        "scale": Command("study:Scale", "studies", "Measure update time against map size."),
+        "report": Command("study:Report", "studies", "Measure the figures of the pages."),
     },
 }
 EXTRAS: Final = {  # packages that the core does without, and the extra that has them
@@ -64,95 +71,118 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads stall systems as small as these
     words = list(sys.argv[1:] if arguments is None else arguments)
-    level = next((LEVELS[word] for word in reversed(words) if word in LEVELS), "NORMAL")
     try:
-        return _run([word for word in words if word not in LEVELS], level)
-    except PathspaceError as error:
-        return _refuse(str(error), level, NOT_SOLVED if isinstance(error, SolveError) else BAD_INPUT)
+        name, options = parse(words)
+        return DONE if options is None else run_command(name, options)
+    except (cyclopts.CycloptsError, PathspaceError) as error:
+        message = str(error) if isinstance(error, PathspaceError) else f"{error!s:.{MOST_SAID}}"
+        return _refuse(message, words, NOT_SOLVED if isinstance(error, SolveError) else BAD_INPUT)
     except ModuleNotFoundError as error:
         if error.name not in EXTRAS:
             raise
         install = f"pip install -e '.[{EXTRAS[error.name]}]'"
-        return _refuse(f"expected the package {error.name} ({install}), found none", level)
+        return _refuse(f"expected the package {error.name} ({install}), found none", words)
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except OSError as error:
-        return _refuse(f"{error.filename or 'output'}: {error.strerror or error}", level)
+        return _refuse(f"{error.filename or 'output'}: {error.strerror or error}", words)
     except KeyboardInterrupt:
-        for worker in active_children():  # they are spared by the signal
+        for worker in import_module("multiprocessing").active_children():  # they are spared by the signal
             if worker.pid is not None:
                 os.kill(worker.pid, signal.SIGTERM)
         print(f"{PROGRAM}: interrupted", file=sys.stderr)
         return INTERRUPTED
 
 
-def _run(words: list[str], level: str) -> int:
-    name, *rest = words or ["help"]
-    if name in ("help", *HELP) and not rest:
-        print(overview())
-    elif name == "help":
-        print(help_of(rest[0]), end="")
-    elif name == "--version":
-        compiler = import_module(".factors", __package__).COMPILER
-        print(f"{PROGRAM} {version(PROGRAM)} (GTSAM {version('gtsam')}, kernels: {compiler})")
-    elif name == "--completion":
-        classes = {one: options_class(one) for one in COMMANDS}
-        print(import_module(".options.help", __package__).completion(PROGRAM, classes, (*LEVELS, JSON)))
-    elif found := next((word for word in rest if word in HELP), None):
-        print(help_of(name, full=found == "--help-all"), end="")
-    else:
-        options = parse_command(name, [word for word in rest if word != JSON])
-        return run_command(name, options, level, as_json=JSON in rest)
-    return DONE
+def parse(words: Sequence[str]) -> tuple[str, Any]:
+    """Name of the command and its options, or None where help, version or completion was printed."""
+    if words[:1] == ["help"]:
+        words = [*words[1:], "--help"]
+    before = [*takewhile(lambda word: word.startswith("-"), words)]
+    name, *rest = words[len(before) :] or [""]
+    if name not in ("", ASK_COMPLETION):
+        check_name(name, COMMANDS, f"expected a command ({', '.join(COMMANDS)})")
+        words = [name, *before, *rest]
+    app = application(name)
+    if name != ASK_COMPLETION and (not words or not set(HELP).isdisjoint(words)):
+        app.help_formatter = import_module(".options.help", __package__).Help(short=HELP_ALL not in words)
+        app.help_print([name] if name else [], console=import_module(".console", __package__).output())
+        return name, None
+    if before == ["--completion"]:
+        shell: Literal["zsh", "bash"] = "zsh" if "zsh" in os.environ.get("SHELL", "") else "bash"
+        print(app.generate_completion(shell=shell))
+        print(f"compdef _cyclopts_{PROGRAM} {PROGRAM}" * (shell == "zsh"))
+        return name, None
+    command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
+    return name, command(*bound.args, **bound.kwargs)
 
 
-def overview() -> str:
-    width = max(map(len, COMMANDS)) + 2
-    lines = [f"usage: {PROGRAM} COMMAND [OPTIONS]"]
-    for title, group in GROUPS.items():
-        lines += [f"\n{title}:", *(f"  {name:<{width}}{command.summary}" for name, command in group.items())]
-    return "\n".join([
-        *lines,
-        f"\n{PROGRAM} COMMAND --help explains a command. Each takes these options as well:",
-        "  -q      prints errors and hints only",
-        "  -v      prints progress in lines, and where an error comes from",
-        "  --json  prints the result as JSON",
-        f'eval "$({PROGRAM} --completion)" completes commands, options and values in bash and zsh.',
-    ])  # fmt: skip
+def application(name: str = "") -> App:
+    """All commands, of which only `name` is imported."""
+    app = App(
+        name=PROGRAM,
+        help="B-spline SLAM of race tracks on GTSAM factor graphs.",
+        help_flags=HELP,
+        help_format="plaintext",
+        error_console=cast(Any, sys.stderr),  # nothing is printed there, and rich takes long to import
+        help_epilogue="" if name else f"{PROGRAM} --completion prints a script for bash or zsh.",
+        version=_version,
+        version_format="plaintext",
+        default_parameter=PARAMETER,
+        config=(_fill_in, _check),
+    )
+    for number, (title, commands) in enumerate(GROUPS.items()):
+        group = cyclopts.Group(title, sort_key=number)
+        for one, command in commands.items():
+            summary = None if one == name else command.summary  # or it would replace the docstring
+            path = f"{__package__}.options.{command.options}"
+            app.command(path, name=one, help=summary, group=group)
+    return app
 
 
-def help_of(name: str, *, full: bool = False) -> str:
-    helper = import_module(".options.help", __package__)
-    text: str = helper.help_of(options_class(name), f"{PROGRAM} {name}", full=full)
-    return text
+def _version() -> str:
+    compiler = import_module(".factors", __package__).COMPILER
+    version = import_module("importlib.metadata").version
+    return f"{PROGRAM} {version(PROGRAM)} (GTSAM {version('gtsam')}, kernels: {compiler})"
 
 
-def options_class(name: str) -> type[Any]:
-    """Dataclass of a command's options; SettingsError for an unknown command."""
-    check_name(name, COMMANDS, f"expected a command ({', '.join(COMMANDS)})")
-    module, found = COMMANDS[name].options.split(".")
-    options: type[Any] = getattr(import_module(f".options.{module}", __package__), found)
-    return options
+def _fill_in(app: App, names: tuple[str, ...], arguments: ArgumentCollection) -> None:
+    """Fill in the settings of a file or of presets where the command line has none."""
+    given = {
+        argument.field_info.name: [token.value for token in argument.tokens]
+        for argument in arguments
+        if argument.tokens and not argument.keys
+    }
+    settings = getattr(app.default_command, "base", lambda _: None)(given)
+    if settings is not None:
+        import_module("cyclopts.config").Dict({names[-1]: asdict(settings)})(app, names, arguments)
 
 
-def parse_command(name: str, words: list[str]) -> Any:
-    """Parse the options of a command; SettingsError for bad usage."""
-    options = options_class(name)
-    return import_module(".options.parse", __package__).parse(options, f"{PROGRAM} {name}", words)
+def _check(_: App, __: tuple[str, ...], arguments: ArgumentCollection) -> None:
+    """Refuse what cyclopts would accept: a value of a whole group, and `2.7` rounded to a whole number."""
+    for argument in arguments:
+        for token in (token for token in argument.tokens if token.source == "cli"):
+            if argument.children:
+                raise cyclopts.UnknownOptionError(
+                    token=token, argument_collection=arguments.filter_by(show=True)
+                )
+            if int in (argument.hint, *get_args(argument.hint)) and not WHOLE.fullmatch(token.value):
+                raise cyclopts.CoercionError(token=token, argument=argument, target_type=int)
 
 
-def run_command(name: str, options: Any, level: str = "NORMAL", *, as_json: bool = False) -> int:
+def run_command(name: str, options: Any) -> int:
     """Run a command with its options; return 3 where the result is written, but can't be trusted."""
     module = import_module(f".commands.{COMMANDS[name].module}", __package__)
-    with import_module(".console", __package__).verbosity("QUIET" if as_json else level):
+    level = "QUIET" if options.quiet or options.json else "VERBOSE" if options.verbose else "NORMAL"
+    with import_module(".console", __package__).verbosity(level):
         outcome = getattr(module, f"{name}_command")(options)
-        outcome.show(as_json=as_json)
+        outcome.show(as_json=options.json)
     return NOT_SOLVED if outcome.wrong else DONE
 
 
-def _refuse(message: str, level: str, code: int = BAD_INPUT) -> int:
-    if level == "VERBOSE":
+def _refuse(message: str, words: Sequence[str], code: int = BAD_INPUT) -> int:
+    if not {"-v", "--verbose"}.isdisjoint(words):
         print_exc()
     print(f"{PROGRAM}: {' '.join(message.split())}", file=sys.stderr)
     return code

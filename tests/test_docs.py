@@ -27,7 +27,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph import FixedLagMapper, Log
-from pathspace_graph.cli import COMMANDS, main, parse_command
+from pathspace_graph.cli import COMMANDS, main, parse
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import write_log
 from pathspace_graph.io.map import read_map
@@ -154,7 +154,7 @@ def test_named_commands_are_accepted(page: Path) -> None:
         if command is not None:
             name, *arguments = re.sub(r"\s+#.*", "", command[1]).split()
             assert name in COMMANDS, line
-            assert parse_command(name, arguments) is not None, line
+            assert parse([name, *arguments]) is not None, line
 
 
 REFERENCE = re.compile(r"`([a-z_]+(?:\.\w+)+)`")

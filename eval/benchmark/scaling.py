@@ -142,7 +142,7 @@ def stops(scaling: Scaling) -> list[str]:
     return lines
 
 
-def write_scaling(out: Path, scaling: Scaling) -> None:
+def write_scaling(out: Path, scaling: Scaling, *, force: bool = False) -> None:
     """Write `points.csv`, `scaling.json` (with slopes and settings), `table.md` and the figure."""
     at = {name: scaling.seconds_at(COMPARED_AT, name) for name in scaling.estimators}
     content = {
@@ -155,7 +155,7 @@ def write_scaling(out: Path, scaling: Scaling) -> None:
         "estimator_settings": scaling.mapper,
         "versions": versions(),
     }
-    with atomic_folder(out, MARKER) as folder:
+    with atomic_folder(out, MARKER, force=force) as folder:
         write_csv(folder / "points.csv", scaling.points)
         scaling_table(scaling).write(folder, "table", "md")
         write_json(folder / MARKER, content)

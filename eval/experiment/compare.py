@@ -204,13 +204,13 @@ def _title(comparison: Comparison, when: str) -> str:
 # --- files -----------------------------------------------------------------------------------------------
 
 
-def write_comparison(out: Path, comparison: Comparison, jobs: int) -> None:
+def write_comparison(out: Path, comparison: Comparison, jobs: int, *, force: bool = False) -> None:
     """Write all files of a comparison (docs/formats.md), or on failure none.
 
-    Each of several logs has a folder of its own. An earlier comparison in `out` becomes a numbered backup.
+    Each of several logs has a folder of its own. An earlier comparison in `out` is replaced if `force`.
     """
     frames = {"table": paper_frame(comparison), "metrics": comparison.frame, "times": comparison.times()}
-    with atomic_folder(out, MARKER) as folder:
+    with atomic_folder(out, MARKER, force=force) as folder:
         for name, table in tables(comparison).items():
             table.write(folder, name, "md", "tex")
         for name, frame in frames.items():

@@ -13,7 +13,7 @@ import pandas as pd
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, OutputError
 from pathspace_graph.eval.metrics.alignment import aligned_distance
-from pathspace_graph.io.files import check_target, remove_manifest, write_json
+from pathspace_graph.io.files import check_target, write_json
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.parsing import read_json, shown
 from pathspace_graph.sim.track import Track
@@ -121,7 +121,6 @@ def run_records(
     """
     check_folder(out, plan)
     with workers(jobs, cluster):
-        remove_manifest(out)  # of a study that goes on; the last step writes it again
         write_json(out / STUDY_FILE, plan.resolved(), indent=1)
         return run_cells(plan.cells, out, on_cell=on_cell, retry_failed=retry_failed)
 
@@ -145,7 +144,7 @@ def check_folder(out: Path, plan: Plan) -> None:
 
     One of the name may have changed: cells are used wherever they mean the same.
     """
-    check_target(out, STUDY_FILE)
+    check_target(out, STUDY_FILE, force=True)
     file = out / STUDY_FILE
     if not file.is_file():
         return

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.io.files import atomic_folder, to_plain, write_json, write_text
-from pathspace_graph.io.manifest import MANIFEST_FILE
+from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.parsing import read_json
 from pathspace_graph.loop.worker import end_with
 
@@ -149,8 +149,7 @@ def write_record(folder: Path, cell: Cell, record: Record) -> None:
     """Write the record as a file of its own, whole or not at all, after the files of its run."""
     files = record.pop(FILES, None)
     if files is not None:
-        shutil.rmtree(run_folder(folder, cell), ignore_errors=True)
-        with atomic_folder(run_folder(folder, cell), MANIFEST_FILE) as run:
+        with atomic_folder(run_folder(folder, cell), MAP_FILE, force=True) as run:
             for name, text in files.items():
                 write_text(run / name, text)
     write_json(_file(folder, cell), {**record, DIGEST: identity(record=record)}, indent=1)

@@ -72,7 +72,7 @@ def recording(
 ) -> "Iterator[Recorder]":
     """Yield an observer that records each cycle, and the true cones if known, to a file, a window, or both.
 
-    The file appears as a whole at the end, with an earlier one as a numbered backup; the window stays open.
+    The file appears as a whole at the end, in the place of an earlier one; the window stays open.
     """
     target = None if file is None else Path(file)
     check_recording(target, window)

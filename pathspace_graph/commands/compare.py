@@ -17,11 +17,10 @@ from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import save_plot
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.io.files import atomic_folder, check_target
-from pathspace_graph.io.log import Log, write_log
-from pathspace_graph.io.results import RunResult, write_result
+from pathspace_graph.io.log import write_log
+from pathspace_graph.io.results import write_result
 from pathspace_graph.options.map import Demo
 from pathspace_graph.options.study import Compare
-from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from .estimate import map_online, outline, tell
@@ -36,19 +35,20 @@ PICTURE_DPI: Final = 150.0  # resolution of the picture, dots per inch, which su
 
 def compare_command(options: Compare) -> Outcome:
     if len(options.log) == 2:
-        return compare_maps(*options.log, options.out)
+        return compare_maps(*options.log, options.out, force=options.force)
     if len(options.log) != 1:
         raise SettingsError(f"LOG: expected one log, or two maps, found {len(options.log)} folders")
-    plan = experiment.plan_of(options.log[0], options.estimators, options.settings, options.own)
+    own = options.own(options.estimators)
+    plan = experiment.plan_of(options.log[0], options.estimators, options.settings, own)
     check_jobs(options.jobs)
-    check_target(options.out, experiment.MARKER)
+    check_target(options.out, experiment.MARKER, force=options.force)
     for drive in dict.fromkeys(cell.drive for cell in plan.cells):
         tell(drive.load()[1], of=drive.source if len(plan.study.logs) > 1 else "")
     with unfinished(options.out) as folder:
         with progress("comparing", lines=LINES) as advance:
             comparison = compare(plan, folder, jobs=options.jobs, on_cell=advance)
         with progress("writing"):
-            experiment.write_comparison(options.out, comparison, options.jobs)
+            experiment.write_comparison(options.out, comparison, options.jobs, force=options.force)
     return report(options.out, comparison)
 
 
@@ -70,34 +70,23 @@ def _name(names: Mapping[str, str]) -> str:
 
 
 def demo_command(options: Demo) -> Outcome:
-    check_target(options.out, PICTURE)
+    check_target(options.out, PICTURE, force=True)
     with progress("driving"):
         log = simulate(generated_track(options.seed), SimulationSettings(laps=options.laps), options.seed)
     say(f"a generated track, {options.laps} times around: {describe(log)}")
-    result, rival = map_with_both(log, options.settings)
-    write_demo(options.out, log, result)
+    with workers(2):  # the rival in another process; with one job it would be run here, and first
+        begun = Parallel(return_as="generator")([delayed(run_estimator)(RIVAL, options.settings, log)])
+        result = map_online(log, make_online(DEFAULT_ONLINE, options.settings, log))
+        with progress(RIVAL):
+            (rival,) = begun  # to the end, or joblib warns of tasks that were cancelled
+    with progress("writing"), atomic_folder(options.out, PICTURE, force=True) as folder:
+        write_log(log, folder / "log")
+        write_result(folder / "map", result, summarize(result, log))
+        picture = plot_map(result.map, log=log, trajectory=result.trajectory, smoothed=result.smoothed)
+        save_plot(picture, folder / PICTURE, PICTURE_DPI)
     table = side_by_side({run.estimator: laps_of(run, log) for run in (result, rival)})
     if table.rows:
         output().print(table.rich())
     say(outline(result))
     say(*not_mapped(result.map, log), f"log, map and {PICTURE}:")
     return Outcome([options.out], {"laps": table.records()})
-
-
-def map_with_both(log: Log, settings: MapperSettings) -> tuple[RunResult, RunResult]:
-    """Map with the spline graph, and with the landmark graph in another process."""
-    with workers(2):  # with one job it would be run here, and first
-        rival = Parallel(return_as="generator")([delayed(run_estimator)(RIVAL, settings, log)])
-        result = map_online(log, make_online(DEFAULT_ONLINE, settings, log))
-        with progress(RIVAL):
-            (landmarks,) = rival  # to the end, or joblib warns of tasks that were cancelled
-        return result, landmarks
-
-
-def write_demo(out: Path, log: Log, result: RunResult) -> None:
-    """Write the log, the map and its picture: all of them, or on failure nothing."""
-    with progress("writing"), atomic_folder(out, PICTURE) as folder:
-        write_log(log, folder / "log")
-        write_result(folder / "map", result, summarize(result, log))
-        picture = plot_map(result.map, log=log, trajectory=result.trajectory, smoothed=result.smoothed)
-        save_plot(picture, folder / PICTURE, PICTURE_DPI)

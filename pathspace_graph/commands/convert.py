@@ -65,13 +65,13 @@ def _records(options: Convert) -> list[Path]:
 
 
 def _convert(options: Convert, source: Path, out: Path) -> None:
-    check_target(out, LOG_FILE)
+    check_target(out, LOG_FILE, force=options.force)
     rule = LabelRule(options.labels, options.label_field)
     with progress("converting"):
         record = windowed(_read(options, source, rule), options.window, source)
         recorded = to_log(record, options.frames, options.noise, source, options.window.spacing)
         log = with_measured_noise(recorded)
-        write_checked(log, out, source)
+        write_checked(log, out, source, force=options.force)
     report(record.notes, rule, log)
     tell(hints(log))
 
@@ -104,10 +104,10 @@ def with_measured_noise(log: Log) -> Log:
     return replace(log, cycles=tuple(cycles))
 
 
-def write_checked(log: Log, out: Path, source: Path) -> None:
+def write_checked(log: Log, out: Path, source: Path, *, force: bool) -> None:
     """Write a log; InputError of its source where reading it would fail."""
     try:
-        write_log(log, out, check=True)
+        write_log(log, out, check=True, force=force)
     except InputError as error:
         where = f"{error.file.name}, row {error.row}" if error.row else error.file.name
         likely = because(hints(log))

@@ -51,15 +51,16 @@ Run = TypeVar("Run", bound=RunResult)
 def online_command(options: Online) -> Outcome:
     check_online_options(options)
     parameters = own_parameters(options)
-    known = known_track(options)
+    known = None if options.on is None else read_known_map(options.on, options.map_sigma, options.settings)
     if options.plot is not None:
         plotting().check_picture(options.plot)
-    viewing = viewers(options)
-    if viewing is not None:
+    viewing = None
+    if options.view or options.save_view is not None:
+        viewing = import_module("pathspace_graph.eval.view.recording")
         viewing.check_recording(options.save_view, options.view)
     log, hints = read_plausible_log(options.log, options.settings.limits)
     tell(hints)
-    log, estimator = begin(options, log, parameters) if known is None else begin_on(options, known, log)
+    log, estimator = begin(options, known, log, parameters)
     with (
         nullcontext()
         if viewing is None
@@ -73,7 +74,7 @@ def online_command(options: Online) -> Outcome:
         differ = [] if known is None else known.differences(result, estimator)
         summarized = summarize(result, log, hints)
         summarized |= {} if known is None else known.summary(estimator, differ)
-        write_result(options.out, result, summarized)
+        write_result(options.out, result, summarized, force=options.force)
     if options.save is not None and isinstance(estimator, FixedLagMapper):
         estimator.save(options.save)
     if options.plot is not None:
@@ -93,19 +94,18 @@ def plotting() -> Any:
     return import_module("pathspace_graph.commands.plot")
 
 
-def viewers(options: Online) -> Any:
-    """Import the module of the viewer if it is requested."""
-    asked = options.view or options.save_view is not None
-    return import_module("pathspace_graph.eval.view.recording") if asked else None
-
-
 def check_online_options(options: Online) -> None:
     """Raise an error where options contradict each other, before anything is mapped."""
     estimators.check_online(options.estimator)
-    check_target(options.out, MAP_FILE)
-    for name in ("save", "resume"):
+    check_target(options.out, MAP_FILE, force=options.force)
+    for name in ("save", "resume", "on"):
         if getattr(options, name) is not None and options.estimator != DEFAULT_ONLINE:
             raise SettingsError(f"--{name}: expected --estimator {DEFAULT_ONLINE}, found {options.estimator}")
+    for name, is_given in (("start", options.start is not None), ("keep-map", options.keep_map)):
+        if is_given and options.on is None:
+            raise SettingsError(f"--{name}: expected --on MAP as well, found none")
+    if options.on is not None and options.resume is not None:
+        raise SettingsError("--on: expected no --resume, since a saved mapper has its own map")
     if options.resume is not None and options.settings != MapperSettings():
         expected = "expected no settings, since the saved mapper has its own"
         raise SettingsError(f"--resume: {expected}, found some")
@@ -116,7 +116,7 @@ def check_online_options(options: Online) -> None:
 def own_parameters(options: Online | Batch) -> Any:
     """Return the estimator's own parameters with those of the file; InputError where something is wrong."""
     try:
-        parameters, rest = estimators.with_parameters(options.estimator, options.own)
+        parameters, rest = estimators.with_parameters(options.estimator, options.own([options.estimator]))
         override(options.settings, rest, "")
     except SettingsError as error:
         raise InputError(options.file or "--settings", str(error)) from error
@@ -124,8 +124,15 @@ def own_parameters(options: Online | Batch) -> Any:
     return parameters
 
 
-def begin(options: Online, log: Log, parameters: Any = None) -> tuple[Log, OnlineEstimator]:
-    """Make an estimator for the log, or restore the saved mapper for the cycles that it has not seen."""
+def begin(
+    options: Online, known: KnownTrack | None, log: Log, parameters: Any
+) -> tuple[Log, OnlineEstimator]:
+    """Make an estimator on a known map or on none, or restore one; and what of the log is left for it."""
+    if known is not None:
+        settings = estimators.settings_of(options.settings, log)
+        start = known.start if options.start is None else np.array(options.start)
+        mapper = FixedLagMapper.on(known.map, settings, log.noise, start=start, keep=options.keep_map)
+        return replace(log, truth=None), mapper  # the truth is in another frame
     if options.resume is None:
         return log, estimators.make_online(options.estimator, options.settings, log, parameters)
     mapper = FixedLagMapper.restore(options.resume)
@@ -137,33 +144,11 @@ def begin(options: Online, log: Log, parameters: Any = None) -> tuple[Log, Onlin
     return replace(log, cycles=cycles), mapper
 
 
-def known_track(options: Online) -> KnownTrack | None:
-    """Read the requested known map; SettingsError where options contradict each other."""
-    if options.on is None:
-        for option, is_given in (("start", options.start is not None), ("keep-map", options.keep_map)):
-            if is_given:
-                raise SettingsError(f"--{option}: expected --on MAP as well, found none")
-        return None
-    if options.estimator != DEFAULT_ONLINE:
-        raise SettingsError(f"--on: expected --estimator {DEFAULT_ONLINE}, found {options.estimator}")
-    if options.resume is not None:
-        raise SettingsError("--on: expected no --resume, since a saved mapper has its own map")
-    return read_known_map(options.on, options.map_sigma, options.settings)
-
-
-def begin_on(options: Online, known: KnownTrack, log: Log) -> tuple[Log, FixedLagMapper]:
-    """Make a mapper on a known map; the log loses its truth, which is in another frame."""
-    settings = estimators.settings_of(options.settings, log)
-    start = known.start if options.start is None else np.array(options.start)
-    mapper = FixedLagMapper.on(known.map, settings, log.noise, start=start, keep=options.keep_map)
-    return replace(log, truth=None), mapper
-
-
 def batch_command(options: Batch) -> Outcome:
     estimators.check_batch(options.estimator)
     if options.start == "odometry" and options.estimator != DEFAULT_BATCH:
         raise SettingsError(f"--start: expected online for {options.estimator}, found {options.start}")
-    check_target(options.out, MAP_FILE)
+    check_target(options.out, MAP_FILE, force=options.force)
     parameters = own_parameters(options)
     if len(options.log) > 1:
         return batch_of_several(options)
@@ -175,7 +160,7 @@ def batch_command(options: Batch) -> Outcome:
         solved = with_own(estimator.solve(log, *more), parameters)
         result: BatchRun = of_kind(solved, options.map, options.settings)
     summarized = summarize_batch(result, log, hints)
-    write_result(options.out, result, summarized)
+    write_result(options.out, result, summarized, force=options.force)
     report(result, log)
     return Outcome([options.out], summarized, untrusted(result))
 
@@ -194,9 +179,12 @@ def batch_of_several(options: Batch) -> Outcome:
     name, result = next(iter(joint.drives.items()))
     result = of_kind(result, options.map, options.settings)
     summarized = summarize_batch(result, logs[name], hints[name]) | summary_of_drives(joint, logs)
-    write_result(options.out, result, summarized, joint.drives)
+    write_result(options.out, result, summarized, joint.drives, force=options.force)
     report(result, logs[name])
-    say(*drive_lines(joint))
+    for name, drive in joint.drives.items():
+        x, y, heading = joint.frames[name].tolist()
+        laps = f"{drive.laps} lap{'' if drive.laps == 1 else 's'}"
+        say(f"{name}: {laps}, begins at ({x:.2f}, {y:.2f}) m, turned by {np.rad2deg(heading):.2f}°")
     left_out = [f"{name} is left out: {why}" for name, why in joint.left_out.items()]
     return Outcome([options.out], summarized, [*left_out, *untrusted(result)])
 
@@ -235,16 +223,6 @@ def summary_of_drives(joint: JointResult, logs: Mapping[str, Log]) -> dict[str, 
         own = summarize(moved_run(result, inverse(joint.frames[name])), logs[name])
         drives[name] = {"frame": joint.frames[name], **{key: own[key] for key in shown if key in own}}
     return {"drives": drives, "left_out": joint.left_out}
-
-
-def drive_lines(joint: JointResult) -> list[str]:
-    """A line for each drive of a joint map."""
-    lines = []
-    for name, result in joint.drives.items():
-        x, y, heading = joint.frames[name].tolist()
-        laps = f"{result.laps} lap{'' if result.laps == 1 else 's'}"
-        lines.append(f"{name}: {laps}, begins at ({x:.2f}, {y:.2f}) m, turned by {np.rad2deg(heading):.2f}°")
-    return lines
 
 
 def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
@@ -300,7 +278,13 @@ def report(result: RunResult, log: Log) -> None:
     """Print the run, the paper's table where there is truth, and on standard error what was not mapped."""
     if laps := laps_of(result, log):
         output().print(laps_table(laps))
-    say(outline(result), *kind_lines(result))
+    say(outline(result))
+    sides = {"line": "on both sides", "line-left": "on the left", "line-right": "on the right"}
+    kind = result.settings.get("kind", "cones")
+    if kind is None:
+        say("too little was seen twice to tell cones from points of a line: cones are assumed")
+    elif kind in sides:
+        say(f"detections are points of a line {sides[kind]}, not of things that stay")
     say(*(f"at {record.t:.1f} s: {record.notice}" for record in result.cycles if record.notice))
     if result.batches is not None and result.batches.late:
         late = f"{result.batches.late} cycle{'' if result.batches.late == 1 else 's'}"
@@ -310,19 +294,6 @@ def report(result: RunResult, log: Log) -> None:
     say(*([] if state is None else diagnose(state, result.settings, result.scale)))
     if missing := not_mapped(result.map, log):
         note("; ".join(missing))
-
-
-def kind_lines(result: RunResult) -> list[str]:
-    """One line about the kind of the sensor, unless it sees cones."""
-    if "kind" not in result.settings:
-        return []
-    words = {"line": "on both sides", "line-left": "on the left", "line-right": "on the right"}
-    kind = result.settings["kind"]
-    if kind is None:
-        return ["too little was seen twice to tell cones from points of a line: cones are assumed"]
-    return (
-        [f"detections are points of a line {words[kind]}, not of things that stay"] if kind in words else []
-    )
 
 
 def outline(result: RunResult) -> str:

@@ -37,7 +37,10 @@ def export_command(options: Export) -> Outcome:
         raise SettingsError(f"--step: {expected}, found {options.step:g}")
     if options.format != "profile" and (options.stop or options.start_speed is not None):
         raise SettingsError(f"--start-speed, --stop: expected --as profile, found --as {options.format}")
-    plane = _plane(options)
+    if options.format in ON_EARTH and options.origin is None:
+        expected = "expected LATITUDE LONGITUDE HEADING in degrees, the heading clockwise from north"
+        raise SettingsError(f"--origin: {expected}, found none, which --as {options.format} needs")
+    plane = None if options.origin is None else LocalPlane(*options.origin)
     file = options.map / MAP_FILE
     if options.format == "tum" and not file.exists() and (options.map / LOG_FILE).exists():
         write_true_path(options.map, options.out)
@@ -67,15 +70,6 @@ def _write(options: Export, file: Path, track: Map, plane: LocalPlane | None) ->
     elif plane is not None:
         write = formats.write_geojson if options.format == "geojson" else formats.write_lanelet2
         write(file, track, options.step, plane)
-
-
-def _plane(options: Export) -> LocalPlane | None:
-    if options.origin is not None:
-        return LocalPlane(*options.origin)
-    if options.format in ON_EARTH:
-        expected = "expected LATITUDE LONGITUDE HEADING in degrees, the heading clockwise from north"
-        raise SettingsError(f"--origin: {expected}, found none, which --as {options.format} needs")
-    return None
 
 
 def write_true_path(folder: Path, out: Path) -> None:

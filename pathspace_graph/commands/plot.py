@@ -1,19 +1,16 @@
-"""`plot` and `verify`: a picture of a map, and a check of files."""
+"""`plot`: a picture of a map."""
 
 from pathlib import Path
 from typing import Any, Final
 
-from pathspace_graph.console import say
 from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import check_plot_file, save_plot
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.files import check_file_target
 from pathspace_graph.io.log import read_log
-from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.parsing import read_json
 from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory
-from pathspace_graph.options.data import Verify
 from pathspace_graph.options.map import Plot
 
 from .outcome import Outcome
@@ -45,9 +42,3 @@ def _differences(file: Path) -> list[tuple[float, float]]:
     """Places (m) at which a map differs from the one that was known, by its summary."""
     summary = read_json(file, "a summary") if file.exists() else {}
     return [(one["x"], one["y"]) for one in summary.get("differences", [])]
-
-
-def verify_command(options: Verify) -> Outcome:
-    count = verify_all(options.folder)
-    say(f"{options.folder}: {count} files are as they were written")
-    return Outcome([], {"folder": options.folder, "files": count})

@@ -16,10 +16,10 @@ from .outcome import Outcome
 
 
 def simulate_command(options: Simulate) -> Outcome:
-    check_target(options.out, LOG_FILE)
+    check_target(options.out, LOG_FILE, force=options.force)
     with progress("driving"):
         log = simulate(_track(options), options.settings, options.seed)
-        write_log(log, options.out)
+        write_log(log, options.out, force=options.force)
     say(describe(log))
     return Outcome([options.out])
 

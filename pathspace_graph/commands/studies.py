@@ -20,7 +20,7 @@ from pathspace_graph.eval.experiment.runner import check_jobs, of_other_code, un
 from pathspace_graph.eval.experiment.study import Study, find_study, read_study_file
 from pathspace_graph.eval.experiment.tables import write_study
 from pathspace_graph.eval.report import Plan, write_report
-from pathspace_graph.io.files import check_target, write_manifest
+from pathspace_graph.io.files import check_target
 from pathspace_graph.options.study import Ablate, FaultSuite, Report, Scale, StudyCommand
 from pathspace_graph.settings.evaluation import ScalingSettings
 
@@ -40,7 +40,6 @@ def execute(
         how: dict[str, Any] = {"cluster": options.cluster, "retry_failed": options.retry_failed}
         frame = run_plan(plan, options.out, jobs=options.jobs, on_cell=advance, **how)
     text = write(study, frame, options.out)
-    write_manifest(options.out)
     say(text.rstrip("\n"), "")
     failures = frame[frame["failure"] != ""]["failure"].tolist()
     wrong = [f"{len(failures)} of {len(plan.cells)} cells failed, the first of {one}" for one in failures[:1]]
@@ -77,14 +76,14 @@ def scale_command(options: Scale) -> Outcome:
         check_online(name, "--estimators")
     if options.quick and options.scaling != ScalingSettings():
         raise SettingsError("--quick: expected no other --scaling options with it, found some")
-    check_target(options.out, timing.MARKER)
+    check_target(options.out, timing.MARKER, force=options.force)
     measured = QUICK if options.quick else options.scaling
     with progress("simulating"):
         drives = make_drives(measured)
     with unfinished(options.out) as folder:
         with progress("timing", drives.cycles, lines=LINES) as advance:
             scaling = measure_scaling(names, drives, measured, options.settings, folder, advance)
-        timing.write_scaling(options.out, scaling)
+        timing.write_scaling(options.out, scaling, force=options.force)
     table = timing.scaling_table(scaling)
     output(wide=True).print(table.rich())
     say(*timing.stops(scaling))

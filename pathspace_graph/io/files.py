@@ -1,5 +1,6 @@
-"""Output that appears as a whole or not at all, and never costs an earlier result."""
+"""Output that appears as a whole or not at all, and never costs an earlier result by mistake."""
 
+import ctypes
 import json
 import math
 import os
@@ -9,7 +10,6 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
-from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -18,47 +18,47 @@ import numpy as np
 
 from pathspace_graph.errors import OutputError
 
-from .manifest import MANIFEST_FILE, manifest_of
-
-try:
-    import fcntl
-except ImportError:  # Windows has no such locks
-    fcntl = None  # type: ignore[assignment]
-
 STDOUT: Final = Path("-")  # path at which a single file is written to standard output
 
 
 @contextmanager
-def atomic_folder(target: Path | str, marker: str) -> Iterator[Path]:
-    """Yield a temporary folder beside `target` that gets a manifest and takes its place on success.
+def atomic_folder(target: Path | str, marker: str, *, force: bool = False) -> Iterator[Path]:
+    """Yield a temporary folder beside `target` that takes its place on success.
 
-    An earlier result, recognized by the file `marker`, is kept as a numbered backup `NAME.~1~`. Anything
-    else except an empty folder is an OutputError.
+    An earlier result, recognized by the file `marker`, is replaced if `force`, and an OutputError without.
+    Anything else except an empty folder is an OutputError.
     """
     final = _followed(target)
-    check_target(final, marker)
+    check_target(final, marker, force=force)
     with _parents(final), _beside(final, Path.mkdir) as temporary:
         yield temporary
-        (temporary / MANIFEST_FILE).write_text(manifest_of(temporary), encoding="utf-8", newline="\n")
-        check_target(final, marker)
-        for path in (*temporary.rglob("*"), temporary):
-            _sync(path)
-        backup = _backup(final)
-        try:
+        check_target(final, marker, force=force)
+        with suppress(OSError):
+            final.rmdir()  # an empty folder is no result
+        if final.exists():
+            _exchange(temporary, final)
+        else:
             temporary.rename(final)
-        except OSError:
-            if backup:
-                backup.rename(final)
-            raise
-        _sync(final.parent)
+
+
+def _exchange(one: Path, other: Path) -> None:
+    """Exchange two folders: on Linux in one step, so that a kill leaves either in its place."""
+    with suppress(TypeError, AttributeError):  # other systems have no such call
+        at, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+        if not ctypes.CDLL(None).renameat2(at, os.fsencode(one), at, os.fsencode(other), exchange):
+            return
+    aside = one.with_suffix(".old")
+    other.rename(aside)
+    one.rename(other)
+    aside.rename(one)
 
 
 @contextmanager
 def atomic_file(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path of the same suffix, whose file takes its place at `path` on success.
 
-    An earlier file is kept as a numbered backup `NAME.~1~`. Symbolic links are followed. Standard output
-    (`-`), a device and a pipe are written in place.
+    An earlier file is replaced. Symbolic links are followed. Standard output (`-`), a device and a pipe are
+    written in place.
     """
     path, final = Path(path), _followed(path)
     if is_stream(path):
@@ -72,7 +72,7 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
                     stream.flush()
         return
     check_file_target(final)
-    with replacing(final, backup=True) as temporary:
+    with replacing(final) as temporary:
         yield temporary
 
 
@@ -82,16 +82,11 @@ def is_stream(path: Path) -> bool:
 
 
 @contextmanager
-def replacing(file: Path, *, backup: bool = False) -> Iterator[Path]:
+def replacing(file: Path) -> Iterator[Path]:
     """Yield a temporary path beside `file` that takes its place on success."""
     with _parents(file), _beside(file, Path.touch) as temporary:
         yield temporary
-        _sync(temporary)
-        if backup:
-            check_file_target(file)
-            _backup(file)
         temporary.replace(file)
-        _sync(file.parent)
 
 
 def write_text(file: Path, text: str) -> None:
@@ -118,19 +113,11 @@ def write_json(file: Path, content: Any, indent: int | None = 2) -> None:
     write_text(file, json.dumps(to_plain(content), indent=indent, allow_nan=False) + "\n")
 
 
-def write_manifest(folder: Path) -> None:
-    write_text(folder / MANIFEST_FILE, manifest_of(folder))
-
-
-def remove_manifest(folder: Path) -> None:
-    (folder / MANIFEST_FILE).unlink(missing_ok=True)
-
-
 # --- checks of the target -------------------------------------------------------------------------------
 
 
-def check_target(target: Path | str, marker: str) -> None:
-    """Raise an OutputError where `atomic_folder` would lose foreign files at `target`, or fail."""
+def check_target(target: Path | str, marker: str, *, force: bool = False) -> None:
+    """Raise an OutputError where `atomic_folder` would lose files at `target`, or fail."""
     if Path(target) == STDOUT:
         raise OutputError(f"{STDOUT}: expected a folder to write; only one file goes to standard output")
     target = _followed(target)
@@ -141,11 +128,13 @@ def check_target(target: Path | str, marker: str) -> None:
         raise OutputError(f"{target}: expected a folder to write, found a file")
     try:
         is_empty = all(is_temporary(entry.name) for entry in target.iterdir())
-        if is_empty or (target / marker).is_file():
-            return
+        is_result = (target / marker).is_file()
     except OSError as error:
         raise OutputError(f"{target}: expected a readable folder: {error.strerror}") from error
-    raise OutputError(f"{target}: expected an empty folder or an earlier result, found files but no {marker}")
+    if not is_empty and not is_result:
+        raise OutputError(f"{target}: expected an empty folder, found files but no {marker}")
+    if is_result and not force:
+        raise OutputError(f"{target}: expected no earlier result, found one (--force replaces it)")
 
 
 def check_file_target(path: Path | str) -> None:
@@ -170,23 +159,6 @@ def _check_parents(target: Path) -> None:
         raise OutputError(f"{nearest}: expected a folder that can be written")
 
 
-def _backup(final: Path) -> Path | None:
-    """Back up a path under a numbered name: a folder is renamed, a file is linked."""
-    with suppress(OSError):
-        final.rmdir()  # an empty folder is no result
-    if not os.path.lexists(final):
-        return None
-    names = (final.with_name(f"{final.name}.~{number}~") for number in count(1))
-    backup = next(name for name in names if not os.path.lexists(name))
-    if final.is_dir():
-        return final.rename(backup)
-    try:
-        os.link(final, backup, follow_symlinks=False)
-    except OSError:  # a file system without hard links
-        shutil.copy2(final, backup, follow_symlinks=False)
-    return backup
-
-
 # --- temporary paths ------------------------------------------------------------------------------------
 
 
@@ -203,8 +175,6 @@ def _parents(final: Path) -> Iterator[None]:
                 with suppress(OSError):
                     parent.rmdir()
             raise
-        for parent in missing:
-            _sync(parent.parent)
 
 
 @contextmanager
@@ -227,54 +197,14 @@ def is_temporary(name: str) -> bool:
 
 @contextmanager
 def _beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
-    """Yield a new path beside `final`, made by `make` and locked, which is gone at the end.
-
-    Unlocked ones, which dead runs left there, are removed as well.
-    """
-    stem, suffix = re.escape(f".{final.stem}."), re.escape(f".tmp{final.suffix}")
-    for path in final.parent.iterdir():
-        if fcntl and re.fullmatch(f"{stem}[0-9a-f]{{8}}{suffix}", path.name):
-            with suppress(OSError), _locked(path):
-                _remove(path)
+    """Yield a new path beside `final`, made by `make`; what is there at the end is removed."""
     # the suffix stays last, as writers choose the format by it
     path = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.tmp{final.suffix}")
     make(path)
-    with _locked(path):
-        try:
-            yield path
-        finally:
-            _remove(path)
-
-
-@contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Lock a path; OSError where another process has locked it. Locks of dead processes end."""
-    if fcntl is None:
-        yield
-        return
-    descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
+        yield path
     finally:
-        os.close(descriptor)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    with suppress(OSError):
-        path.unlink(missing_ok=True)
-
-
-def _sync(path: Path) -> None:
-    """Wait until the content of a file, or the names in a folder, are on the disk."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-    except OSError:
-        if not path.is_dir():  # some systems can't flush a folder
-            raise
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)

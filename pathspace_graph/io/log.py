@@ -283,13 +283,14 @@ def _of_arrays(name: str, *values: ArrayLike) -> Table:
     return Table.of_arrays(Path(name).with_suffix(""), COLUMNS[name], *values)
 
 
-def write_log(log: Log, folder: Path | str, *, check: bool = False) -> None:
+def write_log(log: Log, folder: Path | str, *, check: bool = False, force: bool = False) -> None:
     """Write a log folder that `read_log` gives back exactly, but for cycles without detections.
 
-    It is written as by `atomic_folder`; with `check`, a log that cannot be read is an InputError instead.
+    It is written as by `atomic_folder`, and replaces an earlier log if `force`; with `check`, a log that
+    cannot be read is an InputError instead.
     """
     check_type("log", log, Log)
-    with atomic_folder(folder, LOG_FILE) as target:
+    with atomic_folder(folder, LOG_FILE, force=force) as target:
         (target / LOG_FILE).write_text(headers.to_toml(_sections(log)), encoding="utf-8", newline="\n")
         for name, values in _columns(log).items():
             write_table(target / name, COLUMNS[name], *values)

@@ -258,12 +258,15 @@ def write_result(
     result: RunResult,
     summary: Mapping[str, Any],
     drives: Mapping[str, RunResult] | None = None,
+    *,
+    force: bool = False,
 ) -> None:
     """Write map.json, the trajectories, cycles.csv and summary.json to a folder, as by `atomic_folder`.
 
-    Where several drives were mapped at once, trajectory and cycles of each are in a folder of its name.
+    An earlier map is replaced if `force`. Where several drives were mapped at once, trajectory and cycles of
+    each are in a folder of its name.
     """
-    with atomic_folder(Path(folder), marker=MAP_FILE) as temporary:
+    with atomic_folder(folder, MAP_FILE, force=force) as temporary:
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
         _write_drive(temporary, result)
         for name, drive in (drives or {}).items():

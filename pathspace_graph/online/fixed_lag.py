@@ -235,7 +235,7 @@ class FixedLagMapper(MapperEstimate):
     def save(self, path: Path | str) -> None:
         """Write the mapper to one file, from which `restore` continues to the same map.
 
-        An existing file becomes a numbered backup, and the write is atomic. SettingsError is raised while a
+        An existing file is replaced, and the write is atomic. SettingsError is raised while a
         factor of your own is in the window.
         """
         count = self.road.smoother.user_factors.count

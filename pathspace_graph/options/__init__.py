@@ -1,1 +1,1 @@
-"""The commands as frozen dataclasses of their options; no module here waits for GTSAM or scipy."""
+"""Options of the commands as frozen dataclasses: a field is an option, a field of settings a dotted one."""

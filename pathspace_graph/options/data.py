@@ -1,23 +1,25 @@
-"""`simulate`, `convert` and `verify`: sources of logs, and the check of written files."""
+"""`simulate` and `convert`: sources of logs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
 
 from pathspace_graph.convert.settings import BagOptions, Frames, NoiseSettings, Window
 from pathspace_graph.sim.simulate import PRESETS, SimulationSettings, preset
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings
 
-from .parse import INLINE, PLACE
+from .command import INLINE, FolderCommand
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulate:
+class Simulate(FolderCommand):
     """Drive a track and write the log of it, with truth; a seed gives the same log to the byte."""
 
     out: Path
-    """Folder for the log; an earlier log there is kept as a numbered backup."""
+    """Folder for the log."""
     track: Path | None = None
     """Track file: PacSim or fssim YAML, EUFS or TUM CSV."""
     generate: int | None = None
@@ -31,32 +33,33 @@ class Simulate:
     white noise, a camera's cones, or points of a line."""
     odometry: Literal["plain", "ins"] = "plain"
     """Preset of `--odometry.*` and `--vehicle.rate`, each of which can still be set."""
-    settings: SimulationSettings = field(default_factory=SimulationSettings, metadata=INLINE)
+    settings: Annotated[SimulationSettings, INLINE] = field(default_factory=SimulationSettings)
     """Settings of the drive."""
     generator: TrackGeneratorSettings = field(default_factory=TrackGeneratorSettings)
     """Rules of a generated track."""
 
     @classmethod
-    def base(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Settings of the presets, before any other option is set."""
-        return {"settings": preset({group: given[group] for group in PRESETS if group in given})}
+    def base(cls, given: Mapping[str, Sequence[str]]) -> SimulationSettings | None:
+        """Settings of the presets, if any, which other options override."""
+        named = {group: given[group][0] for group in PRESETS if group in given}
+        return preset(named) if named else None
 
 
 @dataclass(frozen=True, kw_only=True)
-class Convert:
+class Convert(FolderCommand):
     """Write a ROS bag, CSV files or JSON lines as a log, and report what was dropped.
 
     A log is in order of time and in the vehicle frame. A folder of several records becomes a folder of logs.
     """
 
-    source: Path = field(metadata=PLACE)
+    source: Path = field(kw_only=False)
     """Bag (a file, or a folder with metadata.yaml), folder of CSV files, file of JSON lines, or a folder of
     several of these."""
     out: Path
-    """Folder of the log; an earlier log there is kept as a numbered backup."""
-    kind: Literal["bag", "csv", "jsonl"] = field(default="bag", metadata={"name": "from"})
+    """Folder for the log."""
+    kind: Annotated[Literal["bag", "csv", "jsonl"], Parameter(name="--from")] = "bag"
     """Kind of the record."""
-    topics: BagOptions = field(default_factory=BagOptions, metadata=INLINE)
+    topics: Annotated[BagOptions, INLINE] = field(default_factory=BagOptions)
     """Messages of a bag."""
     label_field: str | None = None
     """Field of the label of a detection in a bag; `none` means that there are no labels."""
@@ -70,17 +73,9 @@ class Convert:
     units: tuple[str, ...] = ()
     """Units of the CSV files: length=mm angle=deg time=ns, also speed=km/h and yaw_rate=deg/s, which
     otherwise follow length and angle. Without them it is m, rad and s."""
-    frames: Frames = field(default_factory=Frames, metadata=INLINE)
+    frames: Annotated[Frames, INLINE] = field(default_factory=Frames)
     """Frames of the record."""
-    window: Window = field(default_factory=Window, metadata=INLINE)
+    window: Annotated[Window, INLINE] = field(default_factory=Window)
     """Part of the record to convert."""
-    noise: NoiseSettings = field(default_factory=NoiseSettings, metadata=INLINE)
+    noise: Annotated[NoiseSettings, INLINE] = field(default_factory=NoiseSettings)
     """Noise that the record does not state."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Verify:
-    """Check every file of a folder against its manifest, which each command writes beside its files."""
-
-    folder: Path = field(metadata=PLACE)
-    """Folder of a log, a map, or the result of another command, with its subfolders."""

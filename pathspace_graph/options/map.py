@@ -1,42 +1,52 @@
 """`demo`, `online`, `batch`, `plot` and `export`: maps of logs, and exports of them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Final, Literal
+
+from cyclopts import Group, Parameter
 
 from pathspace_graph.settings.checked import Checked
 from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
 from pathspace_graph.settings.mapper import MapperSettings, Start
 from pathspace_graph.settings.output import RecordingSettings, SpeedSettings
 
-from .parse import INLINE, NO_OPTION, PLACE
+from .command import FILE, INLINE, Command, FolderCommand, suggest
 
 MapKind = Literal["boundaries", "centerline"]
 Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]
 
 
+_SETTINGS: Final = Parameter(group=Group("Settings of the estimators", sort_key=2))
+
+
 @dataclass(frozen=True, kw_only=True)
-class Estimation:
+class Estimation(Command):
     """Options of every command that estimates."""
 
-    file: Path | None = field(default=None, metadata={"name": "settings"})
+    file: Annotated[Path | None, Parameter(name="--settings"), _SETTINGS] = None
     """TOML file of settings, or the summary.json of a run; options on the command line override it. A section
     with the name of the estimator has parameters of its own."""
-    settings: MapperSettings = field(default_factory=MapperSettings, metadata=INLINE)
-    own: dict[str, Any] = field(default_factory=dict, metadata=NO_OPTION)
-    """Own parameters of the estimators that are named, as `NAME.field`, from the file."""
+    settings: Annotated[MapperSettings, INLINE, _SETTINGS] = field(default_factory=MapperSettings)
 
     @classmethod
-    def base(cls, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Settings of the file, before any other option is set."""
-        if "settings" not in given:
-            return {}
-        overrides = import_module("pathspace_graph.io.overrides")  # the help need not wait for NumPy
-        names = given.get("estimators", [given.get("estimator")])
-        settings, own = overrides.read_settings(given["settings"], MapperSettings(), names)
-        return {"settings": settings, "own": own}
+    def base(cls, given: Mapping[str, Sequence[str]]) -> MapperSettings | None:
+        """Settings of the file, if any, which the command line overrides."""
+        names = given.get("estimators", given.get("estimator", ()))
+        return _read_settings(Path(given["file"][0]), names)[0] if "file" in given else None
+
+    def own(self, estimators: Iterable[str]) -> dict[str, Any]:
+        """Own parameters of these estimators, as `NAME.field`, from the file."""
+        return {} if self.file is None else _read_settings(self.file, estimators)[1]
+
+
+def _read_settings(file: Path, estimators: Iterable[str]) -> tuple[MapperSettings, dict[str, Any]]:
+    overrides = import_module("pathspace_graph.io.overrides")  # the help need not wait for NumPy
+    found: tuple[MapperSettings, dict[str, Any]]
+    found = overrides.read_settings(file, MapperSettings(), estimators)
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +54,7 @@ class Demo(Estimation):
     """Simulate a track and map it online: the paper's table beside the landmark graph's, and a picture."""
 
     out: Path = Path("pathspace-demo")
-    """Folder for log, map and picture; an earlier demo there is kept as a numbered backup."""
+    """Folder for log, map and picture, in the place of an earlier demo."""
     seed: int = 8
     """Seed of the track and of all noise; by default one whose first lap is typical."""
     laps: int = 5
@@ -52,14 +62,14 @@ class Demo(Estimation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Online(Checked, Estimation, group=""):
+class Online(Checked, Estimation, FolderCommand, group=""):
     """Map a log online, cycle by cycle, and write the map, the trajectory, the cycles and a summary."""
 
-    log: Path = field(metadata=PLACE)
+    log: Path = field(kw_only=False)
     """Folder of the log."""
     out: Path
-    """Folder for the map; an earlier map there is kept as a numbered backup."""
-    estimator: str = field(default=ONLINE_NAMES[0], metadata={"words": ONLINE_NAMES})
+    """Folder for the map."""
+    estimator: Annotated[str, suggest(*ONLINE_NAMES)] = ONLINE_NAMES[0]
     """Name of the online estimator."""
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
@@ -71,32 +81,32 @@ class Online(Checked, Estimation, group=""):
     """Keep the known map fixed, and only localize."""
     map_sigma: float = 0.15
     """Standard deviation of the cones of a track file, m."""
-    save: Path | None = None
+    save: Annotated[Path | None, FILE] = None
     """File to which the mapper is saved at the end, for `--resume`; only `fixed-lag` can be saved."""
     resume: Path | None = None
     """File of a saved mapper, which continues with its own settings and with cycles after its newest."""
-    plot: Path | None = None
-    """File for a picture of the map (.png, .pdf or .svg); an earlier one is kept as a numbered backup."""
+    plot: Annotated[Path | None, FILE] = None
+    """File for a picture of the map (.png, .pdf or .svg)."""
     view: bool = False
     """Show the run in the live viewer rerun."""
-    save_view: Path | None = None
-    """File (.rrd) for what the viewer shows; an earlier one is kept as a numbered backup."""
+    save_view: Annotated[Path | None, FILE] = None
+    """File (.rrd) for what the viewer shows."""
     recording: RecordingSettings = field(default_factory=RecordingSettings)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Batch(Estimation):
+class Batch(Estimation, FolderCommand):
     """Optimize whole logs at once, and write the map, the trajectory, the cycles and a summary.
 
     Several logs of one track give one map, in the frame of the first, and a trajectory for each. A drive that
     does not fit the map of the others is left out, and the exit code is 3.
     """
 
-    log: tuple[Path, ...] = field(metadata=PLACE)
+    log: tuple[Path, ...] = field(kw_only=False)
     """Folder of the log, or folders of several drives of one track."""
     out: Path
-    """Folder for the map; an earlier map there is kept as a numbered backup."""
-    estimator: str = field(default=BATCH_NAMES[0], metadata={"words": BATCH_NAMES})
+    """Folder for the map."""
+    estimator: Annotated[str, suggest(*BATCH_NAMES)] = BATCH_NAMES[0]
     """Name of the batch estimator."""
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
@@ -105,13 +115,13 @@ class Batch(Estimation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plot(Checked, group=""):
+class Plot(Checked, Command, group=""):
     """Draw a map: both boundaries with their 2-sigma band, control points, trajectory and any truth."""
 
-    map: Path = field(metadata=PLACE)
+    map: Path = field(kw_only=False)
     """Folder of the map."""
-    out: Path
-    """File for the picture (.png, .pdf or .svg); an earlier one is kept as a numbered backup."""
+    out: Annotated[Path, FILE]
+    """File for the picture (.png, .pdf or .svg), or standard output (`-`)."""
     log: Path | None = None
     """Folder of the log whose truth is drawn as well."""
     band_scale: float = 1.0
@@ -121,18 +131,18 @@ class Plot(Checked, group=""):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export:
+class Export(Command):
     """Write a map in a format that planners and other tools read."""
 
-    map: Path = field(metadata=PLACE)
+    map: Path = field(kw_only=False)
     """Folder of the map. With `tum` it may also be a log, whose true path is written."""
-    format: Format = field(metadata={"name": "as"})
+    format: Annotated[Format, Parameter(name="--as")]
     """Format of the file: the centre line with widths as TUM raceline CSV (`centerline`), the trajectory in
     the TUM format (`tum`), boundaries and centre line as GeoJSON (`geojson`), both boundaries as CSV with the
     columns x, y and label (`points`), both boundaries with lanelets as OSM XML (`lanelet2`), or the centre
     line with the speed that friction and curvature allow as CSV (`profile`)."""
-    out: Path
-    """File for the result, or standard output (`-`); an earlier file is kept as a numbered backup."""
+    out: Annotated[Path, FILE]
+    """File for the result, or standard output (`-`)."""
     step: float = 1.0
     """Distance of the points along a curve (m)."""
     origin: tuple[float, float, float] | None = None

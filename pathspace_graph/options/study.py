@@ -2,19 +2,20 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
 from pathspace_graph.settings.evaluation import ScalingSettings
 
+from .command import Command, FolderCommand, suggest
 from .map import Estimation
-from .parse import PLACE
 
 EVERY = (*ONLINE_NAMES, *BATCH_NAMES)
 STUDIES = tuple(sorted(file.stem for file in (Path(__file__).parents[1] / "eval" / "studies").glob("*.toml")))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compare(Estimation):
+class Compare(Estimation, FolderCommand):
     """Run every estimator on a log or a folder of logs; or compare two maps.
 
     Of logs, tables, figures and all maps are written; of two maps, their distances and a picture.
@@ -25,18 +26,18 @@ class Compare(Estimation):
     command resumes after it was killed.
     """
 
-    log: tuple[Path, ...] = field(metadata=PLACE)
+    log: tuple[Path, ...] = field(kw_only=False)
     """Folder of the log, or of several logs; or the folders of two maps of one track."""
     out: Path
-    """Folder for tables, figures and maps; an earlier comparison there is kept as a numbered backup."""
-    estimators: tuple[str, ...] = field(default=(), metadata={"words": EVERY})
+    """Folder for tables, figures and maps."""
+    estimators: Annotated[tuple[str, ...], suggest(*EVERY)] = ()
     """Names of the estimators, online and batch ones; by default all."""
     jobs: int = 1
     """Number of runs at a time, -1 for one on each core; times of updates are comparable with 1 only."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class StudyCommand:
+class StudyCommand(Command):
     """Options of every command that runs a study."""
 
     out: Path
@@ -63,7 +64,7 @@ class StudyCommand:
 class Ablate(StudyCommand):
     """Run a study, or what remains of it, and write its results, its summary and its figures."""
 
-    study: Path = field(metadata=PLACE | {"words": STUDIES})
+    study: Annotated[Path, suggest(*STUDIES)] = field(kw_only=False)
     """TOML file of the study, or name of one that comes with the package."""
     baseline: str | None = None
     """Variant or estimator that the others are compared with, in place of the study's own; a finished study
@@ -78,7 +79,7 @@ class FaultSuite(StudyCommand):
     with the same seed.
     """
 
-    estimator: str = field(default=ONLINE_NAMES[0], metadata={"words": EVERY})
+    estimator: Annotated[str, suggest(*EVERY)] = ONLINE_NAMES[0]
     """Name of the estimator, an online or a batch one."""
     only: tuple[str, ...] = ()
     """Names of the faults to run, as in the table."""
@@ -87,7 +88,7 @@ class FaultSuite(StudyCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scale(Estimation):
+class Scale(Estimation, FolderCommand):
     """Time every online estimator on ever larger maps and more and more detections, and draw the slopes.
 
     All run in this one process, cycle for cycle in turn, so that other work of the machine slows all of them
@@ -98,8 +99,8 @@ class Scale(Estimation):
     """
 
     out: Path
-    """Folder for points, slopes and figures; earlier ones there are kept as a numbered backup."""
-    estimators: tuple[str, ...] = field(default=(), metadata={"words": ONLINE_NAMES})
+    """Folder for points, slopes and figures."""
+    estimators: Annotated[tuple[str, ...], suggest(*ONLINE_NAMES)] = ()
     """Names of the online estimators; by default all."""
     quick: bool = False
     """Take less than a minute, with small maps and few laps, to see that everything works. It excludes all
@@ -109,7 +110,7 @@ class Scale(Estimation):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
+class Report(Command):
     """Measure the figures of the pages, or what remains of them, and write each table as a tidy CSV.
 
     The experiments are `accuracy`, `skidpad`, `camera`, `faults`, `hard`, `lines`, `endurance`, `centerline`,

@@ -61,8 +61,11 @@ class Checked:
 @cache
 def _types(settings: Any) -> dict[str, tuple[Any, str]]:
     """Type of each setting, and the rule of its annotation; empty without one."""
-    kinds = get_type_hints(settings, include_extras=True).items()
-    return {name: get_args(kind) if get_origin(kind) is Annotated else (kind, "") for name, kind in kinds}
+    types = {}
+    for name, hint in get_type_hints(settings, include_extras=True).items():
+        kind, *stated = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        types[name] = kind, next((rule for rule in stated if isinstance(rule, str)), "")
+    return types
 
 
 def is_of(value: Any, kind: Any) -> bool:

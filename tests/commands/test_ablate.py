@@ -59,7 +59,6 @@ def test_the_command_leaves_tables_and_figures(
             "summary.md",
             "summary.tex",
             "table.tex",
-            "manifest.json",
         ),
         "figures/differences.png",
     }

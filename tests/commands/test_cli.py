@@ -123,7 +123,7 @@ def test_settings_of_the_simulator_are_options(tmp_path: Path) -> None:
 
 
 def test_a_map_keeps_the_formats_contract(log_folder: Path, map_folder: Path) -> None:
-    files = {"map.json", "trajectory.tum", "smoothed.tum", "cycles.csv", "summary.json", "manifest.json"}
+    files = {"map.json", "trajectory.tum", "smoothed.tum", "cycles.csv", "summary.json"}
     assert names(map_folder) == files
     content = json.loads((map_folder / "map.json").read_text())
     assert content["format"] == "pathspace-map/1"
@@ -308,11 +308,28 @@ def test_demo_shows_the_table_and_leaves_log_map_and_picture(
     monkeypatch.setattr("pathspace_graph.commands.compare.simulate", lambda *_: read_log(log_folder))
     monkeypatch.chdir(tmp_path)
     assert main(["demo"]) == 0
-    assert names(tmp_path / "pathspace-demo") == {"log", "map", "track.png", "manifest.json"}
+    (tmp_path / "pathspace-demo" / "track.png").write_text("of an earlier demo")
+    assert main(["demo"]) == 0
+    assert (tmp_path / "pathspace-demo" / "track.png").read_bytes().startswith(b"\x89PNG")
+    assert names(tmp_path / "pathspace-demo") == {"log", "map", "track.png"}
     assert read_map(tmp_path / "pathspace-demo" / "map").boundaries
     printed = capsys.readouterr().out
     assert "rmse [m]" in printed
     assert "pathspace-demo" in printed
+
+
+def test_an_earlier_result_is_replaced_by_force_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert simulate(tmp_path / "log") == 0
+    before = contents(tmp_path / "log")
+    assert simulate(tmp_path / "log", "--seed", "1") == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1 and f"{tmp_path / 'log'}: expected no earlier result" in line
+    assert contents(tmp_path / "log") == before
+    assert simulate(tmp_path / "log", "--seed", "1", "--force") == 0
+    assert contents(tmp_path / "log") != before
+    assert names(tmp_path) == {"log"}
 
 
 # --- usage -----------------------------------------------------------------------------------------------
@@ -357,34 +374,20 @@ def test_an_interrupt_leaves_nothing_half_written(
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_explains_the_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([command, "--help"]) == 0
-    shown = capsys.readouterr().out
-    assert "--out" in shown or command == "verify"
-    assert "usage" in shown
+    for words in (["help", command], [command, "-h"], ["-h", command]):
+        assert main(words) == 0
+        shown = capsys.readouterr().out
+        assert shown.startswith(f"Usage: pathspace-graph {command} ")
+        assert "--out" in shown
+        assert "Print the result as JSON" in shown
 
 
 @pytest.mark.parametrize("words", [[], ["help"], ["--help"], ["-h"]])
 def test_the_overview_has_every_command(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == 0
-    shown = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in shown if line.startswith("  ") and line.split()[0] in COMMANDS] == [
-        *COMMANDS
-    ]
-    assert main(["help", "verify"]) == 0
-    assert capsys.readouterr().out.startswith("usage: pathspace-graph verify FOLDER [OPTIONS]")
-
-
-def test_help_explains_the_options_that_commands_share(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ("ablate", "faults"):
-        assert main([command, "--help"]) == 0
-        assert "Number of processes at a time" in capsys.readouterr().out
-
-
-def test_help_shows_each_text_as_one_paragraph(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["online", "--help-all"]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "Time that poses stay in the window, s. --max-poses 400 Largest number of poses" in shown
-    assert "of a model car" not in shown and "0.1 for a model car of 1:10, 3 for a road. All lengths" in shown
+    shown = capsys.readouterr().out
+    for command in COMMANDS.values():
+        assert command.summary in shown
 
 
 def test_it_runs_as_a_program_and_lists_its_commands() -> None:

@@ -56,7 +56,6 @@ def test_the_command_writes_tables_figures_and_maps(
     assert {path.name for path in out.iterdir()} == files | figures | {
         "times.csv",
         "comparison.json",
-        "manifest.json",
         *NAMES,
     }
     assert read_map(out / "gaps").size == 36
@@ -68,7 +67,7 @@ def test_the_command_writes_tables_figures_and_maps(
 
 
 @pytest.mark.slow
-def test_a_second_comparison_keeps_the_first_and_a_failure_ends_in_3(
+def test_a_second_comparison_needs_force_and_a_failure_ends_in_3(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], png_only: None
 ) -> None:
     out = tmp_path / "out"
@@ -76,9 +75,12 @@ def test_a_second_comparison_keeps_the_first_and_a_failure_ends_in_3(
     assert main(command) == 3
     assert "broken on a: failed, ValueError: lost the way" in capsys.readouterr().err
     assert (out / "rings" / "map.json").exists() and not (out / "broken").exists()
-    assert main(command) == 3
-    assert (tmp_path / "out.~1~" / "comparison.json").exists()
-    assert {path.name for path in tmp_path.iterdir()} == {"out", "out.~1~"}, "nothing unfinished is left"
+    assert main(command) == 2
+    assert "(--force replaces it)" in capsys.readouterr().err
+    (out / "table.md").unlink()
+    assert main([*command, "--force"]) == 3
+    assert (out / "table.md").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"out"}, "nothing unfinished is left"
 
 
 def test_where_all_fail_the_tables_say_so(
@@ -153,7 +155,7 @@ def test_two_maps_are_laid_on_each_other(
     assert found["distances"]["left"]["max"] < 1e-6
     np.testing.assert_allclose(found["motion"], 0.0, atol=1e-6)
     assert (out / "apart.png").stat().st_size > 10_000
-    assert main(["compare", str(maps / "rings"), str(maps / "gaps"), "--out", str(out)]) == 0
+    assert main(["compare", str(maps / "rings"), str(maps / "gaps"), "--out", str(out), "--force"]) == 0
     assert json.loads((out / "apart.json").read_text())["distances"]["both"]["max"] > 0.01
 
 

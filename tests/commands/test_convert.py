@@ -44,7 +44,7 @@ def test_what_was_measured_is_said(
     assert summary["noise"]["stated"] == {}
     assert set(summary["noise"]["measured"]["along"]) == {"sigma", "growth", "share", "time"}
     assert summary["notes"][1].startswith("ranges and speeds disagree by")
-    run("online", tmp_path / "log", "--out", tmp_path / "map", "--calibration.trust", "ranges")
+    run("online", tmp_path / "log", "--out", tmp_path / "map", "--calibration.trust", "ranges", "--force")
     assert "the map's size is the ranges'" in capsys.readouterr().out
 
 

@@ -39,7 +39,7 @@ def test_the_command_leaves_a_table_and_all_values(
     assert "latency of detections" in printed and f"written to {out}" in printed
     files = {name for name in contents(out) if not name.startswith("cells/")}
     forms = {f"faults.{suffix}" for suffix in ("txt", "md", "tex", "csv", "json")}
-    assert files == forms | {"study.json", "results.csv", "times.csv", "manifest.json"}
+    assert files == forms | {"study.json", "results.csv", "times.csv"}
     rows = json.loads((out / "faults.json").read_text())["faults"]
     assert [row["fault"] for row in rows] == ["clean", *["latency of detections"] * 3, *["no colours"] * 3]
     results = pd.read_csv(out / "results.csv")

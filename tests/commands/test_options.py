@@ -9,21 +9,22 @@ import sys
 from dataclasses import asdict, replace
 from math import inf
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from pathspace_graph.cli import BROKEN_PIPE, main, parse_command
+from pathspace_graph.cli import BROKEN_PIPE, main, parse
 from pathspace_graph.io.files import write_json
 from pathspace_graph.io.overrides import leaves
-from pathspace_graph.options import help as help_texts
 from pathspace_graph.options.help import ESSENTIAL
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
+from pathspace_graph.sim.simulate import PRESETS, SimulationSettings
 
 SCREEN = 50
 """Lines of a screen."""
 MOST_SETTINGS = 88
-MOST_ESSENTIAL = 12
 ONLINE = ["LOG", "--out", "MAP"]
+COMMAND = ["online", *ONLINE]
 
 
 def help_of(command: str, option: str, capsys: pytest.CaptureFixture[str]) -> str:
@@ -31,49 +32,84 @@ def help_of(command: str, option: str, capsys: pytest.CaptureFixture[str]) -> st
     return capsys.readouterr().out
 
 
+def options_of(*words: str) -> Any:
+    return parse(words)[1]
+
+
 @pytest.mark.parametrize("command", ["online", "batch", "compare", "demo", "scale", "simulate", "convert"])
-def test_the_short_help_fits_two_screens_and_names_the_long_one(
+def test_the_short_help_fits_two_screens(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "100")
     text = help_of(command, "--help", capsys)
     assert len(text.splitlines()) <= 2 * SCREEN
     assert max(map(len, text.splitlines())) <= 100
-    assert f"pathspace-graph {command} --help-all" in text
+    assert ("--help-all also explains" in text) == (command != "convert"), "it has no settings in groups"
 
 
 def test_the_short_help_has_the_essential_settings_and_the_long_one_has_all(
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert set(ESSENTIAL) <= set(leaves(MapperSettings()))
+    monkeypatch.setenv("COLUMNS", "200")
     short, whole = help_of("online", "--help", capsys), help_of("online", "--help-all", capsys)
-    assert "--lag 3 " in short
-    for name in leaves(MapperSettings()):
-        option = name.replace("_", "-").split(".")[-1]
-        assert option in whole, name
-        assert (f"--{name.replace('_', '-')} " in short or name == "calibration.sensor") == (
-            name in ESSENTIAL
-        )
-    assert "--settings PATH" in short
-    assert "--settings PATH" in whole
+    options = {f"--{name.replace('_', '-')}" for name in leaves(MapperSettings())}
+    assert options >= set(ESSENTIAL)
+    for option in options:
+        assert f" {option} " in whole, option
+        assert (f" {option} " in short) == (option in ESSENTIAL or "." not in option), option
 
 
-def test_a_flag_in_the_short_help_is_the_one_that_changes_something(
-    capsys: pytest.CaptureFixture[str],
+def test_help_shows_each_text_as_one_paragraph_with_choices_and_default(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert "--calibration.no-sensor" in help_of("online", "--help", capsys)
-    command = parse_command("online", [*ONLINE, "--calibration.no-sensor"])
-    assert command.settings.calibration.sensor is False
+    monkeypatch.setenv("COLUMNS", "500")
+    shown = help_of("online", "--help-all", capsys)
+    assert "Time that poses stay in the window, s. [default: 3.0]" in shown
+    assert "are measured unless this is `stated`. [choices: measured, stated]" in shown
+    short = help_of("online", "--help", capsys)
+    assert "measured where nothing is [choices: measured, stated]" in short, "the first sentence only"
 
 
-@pytest.mark.parametrize(
-    ("command", "option"),
-    [("convert", "--from bag|"), ("convert", "--sigma-range NUMBER"), ("export", "--as centerline|")],
-)
-def test_the_short_help_names_options_as_the_command_takes_them(
-    command: str, option: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert option in help_of(command, "--help", capsys)
+# --- options as the commands take them -------------------------------------------------------------------
+
+
+def test_options_of_each_kind() -> None:
+    words = "--start 1 -2 -0.5e-1 LOG --out=MAP --max_poses 7 --calibration.no-sensor --spline.degree 2"
+    given = options_of("online", *words.split(), "--kind", "None")
+    assert (given.log, given.out, given.start) == (Path("LOG"), Path("MAP"), (1.0, -2.0, -0.05))
+    assert (given.settings.max_poses, given.settings.kind) == (7, None)
+    assert given.settings.calibration.sensor is False
+    assert given.settings.spline.degree == 2
+    assert given == replace(options_of(*COMMAND), start=given.start, settings=given.settings)
+
+
+def test_options_of_several_values() -> None:
+    given = options_of("ablate", "lag", "--out", "D", "--tracks", "a.csv", "7", "--seeds", "1", "2")
+    assert (given.tracks, given.seeds) == (("a.csv", "7"), (1, 2))
+    given = options_of("convert", "B", "--out", "L", "--labels", "left=1", "right=0", "--columns", "wz=-yaw")
+    assert (given.labels, given.columns) == (("left=1", "right=0"), ("wz=-yaw",))
+    assert options_of("batch", "a", "b", "--out", "M").log == (Path("a"), Path("b"))
+
+
+def test_options_that_are_called_otherwise_than_their_field() -> None:
+    assert options_of("convert", "B", "--out", "L", "--from", "csv").kind == "csv"
+    assert options_of("export", "M", "--as", "tum", "--out", "-").out == Path("-")
+
+
+def test_presets_set_what_no_option_sets() -> None:
+    command = ["simulate", "--event", "skidpad", "--out", "L"]
+    given = options_of(*command, "--sensor", "camera", "--sensor.range-max", "9", "--odometry", "ins")
+    preset = PRESETS["sensor"]["camera"]
+    assert given.settings.sensor == replace(preset["sensor"], range_max=9.0)
+    assert given.settings.faults == preset["faults"]
+    assert given.settings.odometry == PRESETS["odometry"]["ins"]["odometry"]
+    assert options_of(*command).settings == SimulationSettings()
+
+
+def test_flags_of_every_command_stand_before_or_after_it() -> None:
+    for words in (["-q", *COMMAND, "-v"], [*COMMAND, "--quiet", "--verbose"]):
+        given = options_of(*words)
+        assert (given.quiet, given.verbose, given.json) == (True, True, False)
 
 
 # --- settings from a file --------------------------------------------------------------------------------
@@ -93,13 +129,13 @@ def test_every_command_that_estimates_reads_what_a_summary_holds(command: str, t
     file = tmp_path / "summary.json"
     write_json(file, {"estimator": "fixed-lag", "settings": asdict(CHANGED), "laps": 1})
     places = ["LOG"] if command in ("online", "batch", "compare") else []
-    assert parse_command(command, [*places, "--out", "X", "--settings", str(file)]).settings == CHANGED
+    assert options_of(command, *places, "--out", "X", "--settings", str(file)).settings == CHANGED
 
 
 def test_options_on_the_command_line_stand_over_the_file(tmp_path: Path) -> None:
     file = tmp_path / "my.toml"
     file.write_text("lag = 2\ngate.huber = inf\n[spline]\ndegree = 2\n")
-    given = parse_command("online", [*ONLINE, "--gate.chi", "4", f"--settings={file}", "--lag", "5"])
+    given = options_of(*COMMAND, "--gate.chi", "4", f"--settings={file}", "--lag", "5")
     assert given.out == Path("MAP")
     assert given.settings.lag == 5.0
     assert given.settings.gate == GateSettings(chi=4.0, huber=inf)
@@ -142,7 +178,6 @@ def test_a_bad_summary_is_one_line_too(
 def test_the_estimators_have_few_settings() -> None:
     """A number that neither a user nor a study changes is a constant."""
     assert len(leaves(MapperSettings())) <= MOST_SETTINGS
-    assert len(ESSENTIAL) <= MOST_ESSENTIAL
 
 
 # --- what every command takes ----------------------------------------------------------------------------
@@ -166,10 +201,13 @@ def test_a_quiet_command_prints_no_result_and_a_verbose_one_says_where_an_error_
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="bash isn't installed")
-def test_the_shell_completes_commands_and_options(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_shell_completes_commands_options_and_values(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SHELL", "/bin/bash")
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     assert main(["--completion"]) == 0
     script = capsys.readouterr().out
-    assert "--as" in script and "--format" not in script, "an option that is called otherwise than its field"
 
     def completed(*words: str) -> list[str]:
         line = " ".join(("pathspace-graph", *words))
@@ -180,26 +218,25 @@ def test_the_shell_completes_commands_and_options(capsys: pytest.CaptureFixture[
         return done.stdout.split()
 
     assert completed("on") == ["online"]
-    assert completed("online", "--spline.deg") == ["--spline.degree"]
     assert completed("batch", "MAP", "--spline.deg") == ["--spline.degree"]
-    assert completed("simulate", "--ev") == ["--event"]
-    assert completed("plot", "MAP", "--band") == ["--band-scale"]
     assert completed("convert", "--fro") == ["--from", "--from-poses"]
-    assert completed("convert", "--sigma-b") == ["--sigma-bearing"]
-    assert completed("verify", "--spline") == []
-    assert completed("online", "LOG", "--estimator", "ck") == ["ckf"]
+    assert completed("plot", "--spline") == []
     assert completed("export", "MAP", "--as", "la") == ["lanelet2"]
+    assert completed("online", "LOG", "--estimator", "ck") == ["ckf"], "names that are no choices"
     assert completed("ablate", "degr") == ["degree"]
+    monkeypatch.setenv("SHELL", "/usr/bin/zsh")
+    assert main(["--completion"]) == 0
+    assert capsys.readouterr().out.endswith("\ncompdef _cyclopts_pathspace-graph pathspace-graph\n")
 
 
+@pytest.mark.parametrize("words", [["--completion"], ["online", "--help-all"]])
 def test_a_reader_that_has_seen_enough_is_no_error(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It has closed the pipe before all was printed."""
-    monkeypatch.setattr(help_texts, "completion", lambda *_: 100_000 * "x")
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as out:
         monkeypatch.setattr(sys, "stdout", out)
-        assert main(["--completion"]) == BROKEN_PIPE
+        assert main(words) == BROKEN_PIPE
     assert capsys.readouterr().err == ""

@@ -17,27 +17,29 @@ USAGES = """
 onlin | found 'onlin', the nearest is 'online'
 help onlin | found 'onlin', the nearest is 'online'
 zzz | report), found 'zzz'
-online | online: expected LOG and --out PATH, found none (see pathspace-graph online --help)
-online LOG --out | --out: expected a path, found none (see
-online LOG --out --lag 2 | --out: expected a path, found none (see
-online LOG MAP --out X | online: expected one LOG, found 'LOG MAP' (see
+online | --log requires an argument
+online LOG | --out requires an argument
+online LOG --out | --out requires an argument
+online LOG --out --lag 2 | --out requires an argument
+online LOG MAP --out X | ['MAP']
 online LOG --out MAP | LOG: expected a log folder
-online LOG --out MAP --lag long | --lag: expected a number, found 'long' (see
+online LOG --out MAP --lag long | --lag: unable to convert "long"
 online LOG --out MAP --lag nan | lag: expected a positive number, found nan
 online LOG --out MAP --lag -1 | lag: expected a positive number, found -1
-online LOG --out MAP --lag 2 --lag 3 | --lag: expected it once, found it twice
-online LOG --out MAP --zzz 1 | expected a known option, found '--zzz' (see
-online LOG --out MAP --estimatr ckf | the nearest is '--estimator' (see
+online LOG --out MAP --lag 2 --lag 3 | --lag specified multiple times
+online LOG --out MAP --zzz 1 | Unknown option: --zzz
+online LOG --out MAP --estimatr ckf | Did you mean --estimator?
 online LOG --out MAP --estimator magic | ckf, fixed-lag, landmark-ckf, landmark-fixed-lag), found 'magic'
-online LOG --out MAP -o X | online: expected a known option, found '-o'
-online LOG --out MAP --max_poses=x | --max-poses: expected a whole number, found 'x' (see
-online LOG --out MAP --keep-map=yes | --keep-map: expected a flag without a value
-online LOG --out MAP --noise x | --noise: expected one of measured, stated, found 'x'
+online LOG --out MAP -o X | Unknown option: -o
+online LOG --out MAP --gate 3 | Unknown option: --gate
+online LOG --out MAP --max-poses 2.7 | --max-poses: unable to convert
+online LOG --out MAP --keep-map=x | --keep-map: unable to convert
+online LOG --out MAP --noise x | Choose from: "measured", "stated"
 online LOG --out MAP --plot map.doc | map.doc: expected a file name that ends
 online LOG --out MAP --save / | expected a file to write, found a folder
 online LOG --out MAP --estimator ckf --save S | --save: expected --estimator
 online LOG --out MAP --resume S --lag 2 | --resume: expected no settings
-online LOG --out MAP --settings --lag 3 | --settings: expected a path, found none
+online LOG --out MAP --settings --lag 3 | --settings requires an argument
 online LOG --out MAP --settings none.toml | none.toml: expected a file of settings, found none
 online LOG --out MAP --spline.degree 0 | spline.degree: expected a positive number
 online LOG --out MAP --gauge.sigma-spacing inf | gauge.sigma_spacing: expected a positive number
@@ -46,14 +48,14 @@ online LOG --out MAP --start 0 0 0 | --start: expected --on MAP as well, found n
 online LOG --out MAP --keep-map | --keep-map: expected --on MAP as well, found none
 online LOG --out MAP --on map --estimator ckf | --on: expected --estimator fixed-lag, found ckf
 online LOG --out MAP --on map --resume S | --on: expected no --resume, since a saved mapper has its own map
-online LOG --out MAP --on map --start 1 2 | --start: expected 3 numbers
+online LOG --out MAP --on map --start 1 2 | --start requires 3
 online LOG --out MAP --on map --map-sigma 0 | map_sigma: expected a positive number, found 0
 online LOG --out MAP --on nowhere | nowhere: expected a map's folder, a track file, skidpad or acceleration
-batch --out MAP | batch: expected LOG, found none
+batch --out MAP | --log requires an argument
 batch a b --out MAP --estimator landmark-batch | --estimator: expected spline for several logs
 batch a b --out MAP | a: expected a log folder, found none
-export map --out F | export: expected --as centerline|tum|
-export map --out F --as word | --as: expected one of
+export map --out F | --as requires an argument
+export map --out F --as word | --as. Choose from: "centerline", "tum"
 export map --out F --as geojson | --origin: expected LATITUDE LONGITUDE HEADING in degrees
 export map --out F --as lanelet2 | which --as lanelet2 needs
 export map --out F --as lanelet2 --origin 95 0 0 | origin: expected a latitude between -90 and 90 degrees
@@ -66,16 +68,17 @@ export map --out F --as tum | trajectory.tum: expected a trajectory, found none
 plot map --out map.doc | map.doc: expected a file name that ends
 plot MAP --out map.png | map.json: expected a map, found none
 plot map --out map.png --band-scale 0 | band_scale: expected a positive number
-convert --from csv --out LOG | convert: expected SOURCE, found none
-convert BAG --out LOG --sigma-odometry 1 2 | --sigma-odometry: expected 3 numbers, found '1 2' (see
-convert BAG --out LOG --mounting 1 -2 a | --mounting: expected 3 numbers, found '1 -2 a' (see
+convert --from csv --out LOG | --source requires an argument
+convert BAG --out LOG --sigma-odometry 1 2 | --sigma-odometry requires 3
+convert BAG --out LOG --mounting 1 -2 a | --mounting: unable to convert "a"
 convert BAG --out LOG --range-max 0 | range_max: expected a positive number, found 0
 convert BAG --out LOG --start 3 --end 2 | start: expected less than end, found 3 and 2
 convert BAG --out LOG --time-offset nan | time_offset: expected a number, found nan
 simulate --out LOG | expected one of --track FILE, --generate SEED or --event NAME
 simulate --generate 1 --event skidpad --out LOG | expected one of --track FILE
-simulate LOG --generate 1 | simulate: expected options only, found 'LOG' (see
-simulate --generate 99999999999999999999 --out LOG | --generate: expected whole numbers up to 9223
+simulate LOG --generate 1 --out X | ['LOG']
+simulate --generate 99999999999999999999 --out LOG | --generate: unable to convert
+simulate --generate 1 --sensor lidar --out LOG | sensor
 simulate --generate -1 --out LOG | seed of a generated track: expected at least 0
 simulate --generate 1 --laps 0 --out LOG | laps: expected a positive number
 simulate --generate 1 --out LOG --sensor.fov nan | sensor.fov: expected a positive number
@@ -83,6 +86,7 @@ simulate --event skidpad --out LOG --faults.sensor.colourless 2 | colourless: ex
 simulate --track none.yaml --out LOG | none.yaml: expected a track file, found none
 ablate lagg --out D | the nearest is 'lag'
 ablate none.toml --out D | none.toml
+ablate lag --out D --tracks | --tracks requires at least 1 element
 ablate lag --out D --jobs 0 | jobs: expected
 ablate lag --out D --laps 0 | --laps: expected at least 1
 ablate lag --out D --baseline lagg | --baseline: expected a variant or an estimator
@@ -90,7 +94,6 @@ ablate lag --out D --tracks none.yaml | none.yaml
 faults --out D --only latenc | the nearest is 'latency of detections'
 faults --out D --estimator fixed-lagg | the nearest is 'fixed-lag'
 scale --out D --estimators foo | --estimators: expected a known online estimator
-verify | verify: expected FOLDER, found none
 """
 
 

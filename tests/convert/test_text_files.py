@@ -19,7 +19,10 @@ def write(folder: Path, odometry: str, detections: str) -> Path:
 
 
 def convert(folder: Path, *options: str) -> Log:
-    assert main(["convert", str(folder), "--from", "csv", "--out", str(folder / "log"), *options]) == 0
+    assert (
+        main(["convert", str(folder), "--from", "csv", "--out", str(folder / "log"), "--force", *options])
+        == 0
+    )
     return read_log(folder / "log")
 
 

@@ -14,7 +14,6 @@ from pathlib import Path
 
 from pathspace_graph.eval.experiment.study import read_study_file
 from pathspace_graph.io.log import read_log
-from pathspace_graph.io.manifest import verify_all
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import read_trajectory
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -82,5 +81,4 @@ TARGETS = {
     "track": Target({"track.yaml": "", "track.csv": ""}, read_tracks),
     "study": Target({"study.toml": ""}, lambda folder: read_study_file(folder / "study.toml")),
     "snapshot": Target({"mapper.snap": "", "content.pickle": ""}, read_snapshots),
-    "manifest": Target({"manifest.json": "", "odometry.csv": LOG["odometry.csv"]}, verify_all),
 }

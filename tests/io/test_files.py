@@ -1,7 +1,8 @@
-"""Output appears as a whole or not at all, and keeps what was there."""
+"""Output appears as a whole or not at all, and costs nothing that was there by mistake."""
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import subprocess
@@ -17,13 +18,14 @@ from pathspace_graph.io.files import (
     atomic_folder,
     check_file_target,
     check_target,
+    is_temporary,
     write_json,
 )
 from pathspace_graph.io.parsing import read_json
 
 
-def write_result(target: Path, text: str) -> None:
-    with atomic_folder(target, "marker") as folder:
+def write_result(target: Path, text: str, *, force: bool = False) -> None:
+    with atomic_folder(target, "marker", force=force) as folder:
         (folder / "marker").write_text(text)
 
 
@@ -43,11 +45,21 @@ def test_empty_folder_is_used(tmp_path: Path) -> None:
     assert names(tmp_path) == ["out"]
 
 
-def test_earlier_results_become_numbered_backups(tmp_path: Path) -> None:
-    for text in "123":
-        write_result(tmp_path / "out", text)
-    assert names(tmp_path) == ["out", "out.~1~", "out.~2~"]
-    assert [(tmp_path / name / "marker").read_text() for name in names(tmp_path)] == ["3", "1", "2"]
+@pytest.mark.parametrize("system", ["Linux", "other"])
+def test_an_earlier_result_is_refused_or_replaced_by_force(
+    system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if system == "other":
+        monkeypatch.setattr(ctypes, "CDLL", lambda _: object())
+    write_result(tmp_path / "out", "1")
+    (tmp_path / "out" / "old").write_text("of the first")
+    with pytest.raises(OutputError, match=r"out: expected no earlier result, found one \(--force"):
+        write_result(tmp_path / "out", "2")
+    assert (tmp_path / "out" / "marker").read_text() == "1"
+    write_result(tmp_path / "out", "2", force=True)
+    assert names(tmp_path) == ["out"]
+    assert names(tmp_path / "out") == ["marker"]
+    assert (tmp_path / "out" / "marker").read_text() == "2"
 
 
 def test_foreign_things_are_refused_and_kept(tmp_path: Path) -> None:
@@ -58,7 +70,7 @@ def test_foreign_things_are_refused_and_kept(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match="expected"):
             check_target(tmp_path / target, "marker")
         with pytest.raises(OutputError):
-            write_result(tmp_path / target, "1")
+            write_result(tmp_path / target, "1", force=True)
     assert names(tmp_path) == ["file", "foreign"]
     assert names(tmp_path / "foreign") == ["thing"]
 
@@ -69,7 +81,7 @@ def test_failure_leaves_nothing_and_keeps_the_earlier_result(
 ) -> None:
     write_result(tmp_path / "out", "1")
     for target in (tmp_path / "out", tmp_path / "new" / "deep"):
-        with pytest.raises(error), atomic_folder(target, "marker") as folder:
+        with pytest.raises(error), atomic_folder(target, "marker", force=True) as folder:
             (folder / "half").write_text("?")
             raise error
     assert names(tmp_path) == ["out"]
@@ -91,7 +103,7 @@ def test_single_file(tmp_path: Path) -> None:
             assert path.suffix == ".png"
             path.write_text(text)
     assert (tmp_path / "deep" / "plot.png").read_text() == "2"
-    assert (tmp_path / "deep" / "plot.png.~1~").read_text() == "1"
+    assert names(tmp_path / "deep") == ["plot.png"]
     with pytest.raises(OutputError, match="found a folder"):
         check_file_target(tmp_path / "deep")
 
@@ -112,22 +124,14 @@ def test_links_are_followed(tmp_path: Path) -> None:
         (tmp_path / name).symlink_to(tmp_path / "there" / name)
     write_result(tmp_path / "there" / "folder", "1")
     (tmp_path / "there" / "file").write_text("1")
-    write_result(tmp_path / "folder", "2")
+    write_result(tmp_path / "folder", "2", force=True)
     for name in ("file", "new"):
         with atomic_file(tmp_path / name) as path:
             path.write_text("2")
     assert all((tmp_path / name).is_symlink() for name in ("file", "folder", "new"))
     assert names(tmp_path) == ["file", "folder", "new", "there"]
-    assert names(tmp_path / "there") == ["file", "file.~1~", "folder", "folder.~1~", "new"]
+    assert names(tmp_path / "there") == ["file", "folder", "new"]
     assert (tmp_path / "folder" / "marker").read_text() == (tmp_path / "file").read_text() == "2"
-
-
-def test_a_link_to_itself_is_not_lost(tmp_path: Path) -> None:
-    (tmp_path / "loop").symlink_to("loop")
-    with atomic_file(tmp_path / "loop") as path:
-        path.write_text("1")
-    assert (tmp_path / "loop").read_text() == "1"
-    assert (tmp_path / "loop.~1~").is_symlink()
 
 
 def test_a_pipe_is_written_in_place(tmp_path: Path) -> None:
@@ -212,7 +216,7 @@ def work(*_):
         print("ready", flush=True)
         time.sleep(60.0)
 
-cli._run = work
+cli.parse = work
 sys.exit(cli.main())
 """
 
@@ -228,6 +232,26 @@ def test_nothing_hidden_stays_where_a_command_is_terminated(tmp_path: Path) -> N
 
 
 # --- JSON ------------------------------------------------------------------------------------------------
+
+
+def test_two_runs_beside_each_other_do_not_harm_one_another(tmp_path: Path) -> None:
+    with atomic_file(tmp_path / "f.txt") as first:
+        first.write_text("1")
+        with atomic_file(tmp_path / "f.txt") as second:
+            second.write_text("2")
+        assert (tmp_path / "f.txt").read_text() == "2"
+    assert (tmp_path / "f.txt").read_text() == "1"
+    with pytest.raises(OutputError, match="--force"), atomic_folder(tmp_path / "out", "marker") as folder:
+        (folder / "marker").write_text("1")
+        write_result(tmp_path / "out", "2")
+    assert (tmp_path / "out" / "marker").read_text() == "2"
+    assert names(tmp_path) == ["f.txt", "out"]
+
+
+def test_a_folder_with_leftovers_only_is_an_empty_one(tmp_path: Path) -> None:
+    (tmp_path / ".study.0123abcd.tmp.json").write_text("{")
+    check_target(tmp_path, "study.json")
+    assert not is_temporary(".study.json") and not is_temporary("study.0123abcd.tmp.json")
 
 
 def test_a_folder_that_cannot_be_written_is_refused_beforehand(

@@ -1,11 +1,10 @@
-"""A flipped byte in any file that is written is named by `verify`, and read or refused by the readers.
+"""A flipped byte in any file that is written is read or refused by the readers.
 
 `FLIPS=3000 pytest tests/io/test_flipped_bytes.py` does it more often.
 """
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +18,6 @@ from pathspace_graph.eval.experiment.runner import read_record, write_record
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.log import FILES, read_log, write_log
-from pathspace_graph.io.manifest import MANIFEST_FILE, verify_all
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import read_trajectory, write_result
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -36,7 +34,6 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "map.json": ("map", read_map),
     "trajectory.tum": ("map", lambda folder: read_trajectory(folder / "trajectory.tum")),
     "cycles.csv": ("map", read_cycles),
-    "summary.json": ("map", verify_all),
     "mapper.snap": ("snapshot", lambda folder: FixedLagMapper.restore(folder / "mapper.snap")),
 }
 
@@ -74,25 +71,8 @@ def refused(file: Path, read: Callable[[Path], object]) -> int:
 @pytest.mark.parametrize("name", READERS)
 def test_in_a_file_of_a_log_or_a_map(name: str, written: Path) -> None:
     folder, read = READERS[name]
-    if name == "mapper.snap":
-        assert refused(written / folder / name, read) == FLIPS
-        return
-    refused(written / folder / name, read)
-    assert refused(written / folder / name, verify_all) == FLIPS
-
-
-def test_in_a_manifest(written: Path) -> None:
-    """What the manifest says is no longer true, or it is no manifest; a blank may be another one."""
-    file = written / "map" / MANIFEST_FILE
-    good, rng = file.read_bytes(), np.random.default_rng(0)
-    for _ in range(FLIPS):
-        file.write_bytes(flipped(good, rng))
-        try:
-            verify_all(file.parent)
-        except InputError:
-            continue
-        assert json.loads(file.read_bytes()) == json.loads(good)
-    file.write_bytes(good)
+    count = refused(written / folder / name, read)
+    assert count == FLIPS or name != "mapper.snap", "it has a digest"
 
 
 def test_in_a_cell_of_a_study(tmp_path: Path) -> None:
@@ -109,17 +89,6 @@ def test_in_a_cell_of_a_study(tmp_path: Path) -> None:
         assert found is None or found == record  # another blank between two values is no other content
     file.write_text("[]")
     assert read_record(tmp_path, cell) is None
-
-
-def test_a_log_that_a_user_has_edited_is_read_and_only_verify_says_so(tmp_path: Path) -> None:
-    write_log(small_log(), tmp_path / "log")
-    file = tmp_path / "log" / "odometry.csv"
-    header, first, *others = file.read_text().splitlines()
-    t, _ = first.split(",", 1)
-    file.write_text("\n".join([header, f"{t},7,0,0", *others]))
-    assert read_log(tmp_path / "log").odometry.twist[0].tolist() == [7.0, 0.0, 0.0]
-    with pytest.raises(InputError, match=r"odometry\.csv: expected the file as it was written"):
-        verify_all(tmp_path / "log")
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,6 @@ def test_the_folder_holds_the_four_files_of_the_contract(tmp_path: Path) -> None
         "trajectory.tum",
         "cycles.csv",
         "summary.json",
-        "manifest.json",
     }
     rows = (tmp_path / "map" / "cycles.csv").read_text().splitlines()
     assert rows[0] == "cycle,t,seconds,size_left,size_right,readings,lap,offered,health,reason,dropped"

@@ -21,7 +21,7 @@ from ..scenes.drives import short_drive
 
 
 def written(log: Log, folder: Path) -> Path:
-    write_log(log, folder)
+    write_log(log, folder, force=True)
     return folder
 
 
@@ -56,7 +56,6 @@ def test_a_refusal_names_its_likely_cause_in_one_line(
 
 def test_a_refusal_without_a_likely_cause_is_as_it_was(tmp_path: Path) -> None:
     folder = written(short_drive(), tmp_path / "log")
-    (folder / "manifest.json").unlink(missing_ok=True)
     lines = (folder / "odometry.csv").read_text().splitlines()
     lines[5] = "0.08,fast,0,0"
     (folder / "odometry.csv").write_text("\n".join(lines))
@@ -114,7 +113,6 @@ def test_a_hint_is_told_and_the_log_is_mapped(
 
 def test_labels_of_a_detector_are_told(tmp_path: Path) -> None:
     folder = written(short_drive(), tmp_path / "log")
-    (folder / "manifest.json").unlink(missing_ok=True)
     text = (folder / "detections.csv").read_text()
     (folder / "detections.csv").write_text(text.replace("left", "cone_b").replace("right", "cone_y"))
     _, (hint,) = read_plausible_log(folder, LimitSettings())

@@ -92,7 +92,7 @@ def test_a_recording_needs_its_suffix_and_its_folder(tmp_path: Path) -> None:
         check_recording(tmp_path / "file" / "a.rrd", False)
 
 
-def test_a_recording_that_fails_leaves_nothing_and_an_earlier_one_is_kept(tmp_path: Path) -> None:
+def test_a_recording_that_fails_leaves_nothing_and_another_one_is_replaced(tmp_path: Path) -> None:
     file = tmp_path / "a.rrd"
     with pytest.raises(ZeroDivisionError), recording(file):
         raise ZeroDivisionError
@@ -100,4 +100,4 @@ def test_a_recording_that_fails_leaves_nothing_and_an_earlier_one_is_kept(tmp_pa
     for _ in range(2):
         with recording(file):
             pass
-    assert {path.name for path in tmp_path.iterdir()} == {"a.rrd", "a.rrd.~1~"}
+    assert {path.name for path in tmp_path.iterdir()} == {"a.rrd"}
