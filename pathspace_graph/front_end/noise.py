@@ -27,6 +27,12 @@ MOST_CYCLES: Final = 300  # largest number of newest cycles in a measurement, wh
 DRIVING_SPEED: Final = 0.3  # least speed of driving (m/s)
 SCALE, BIAS = SENSOR.index("range_scale"), SENSOR.index("range_bias")
 """Indices of the errors of the ranges."""
+DOUBT_SCALE: Final = (0.8, 0.5)
+"""Contradiction of the scale by that of another error: alone, and beside a contradicted one.
+
+A disagreement of ranges and speeds is likelier an error of 3 % of the ranges than one of the odometry from
+3.2 sigmas of the latter on if every twentieth sensor has such an error, and from 2.0 if every other one has.
+"""
 SIGMA_FREE: Final = 0.02  # prior sigma of the scale of the ranges where odometry sets the size (-)
 REFERENCE_RANGE: Final = 10.0  # range at which the noise of ranges bounds their scale error (m)
 
@@ -210,11 +216,18 @@ class NoiseLearner(Copyable):
 
 
 def _contradicted(measured: MeasuredNoise, settings: MapperSettings) -> BoolArray:
-    """Return which measured errors (5,) of the sensor contradict their priors."""
+    """Return which measured errors (5,) of the sensor contradict their priors.
+
+    The scale of the ranges is seen beside that of the speeds only. A sensor of which another prior is
+    contradicted is likelier to have a wrong scale as well, so less is needed (`DOUBT_SCALE`).
+    """
     sensor, prior = settings.calibration, np.array(settings.calibration.sigmas)
     prior[SCALE] = np.hypot(prior[SCALE], settings.odometry.sigma_scale)
-    off = np.abs(measured.sensor - sensor.means)
-    return np.asarray(off > sensor.doubt * np.hypot(measured.sensor_sigma, prior))
+    sigmas = np.abs(measured.sensor - sensor.means) / np.hypot(measured.sensor_sigma, prior)
+    contradicted = np.asarray(sigmas > sensor.doubt)
+    others = bool(np.delete(contradicted, SCALE).any())
+    contradicted[SCALE] = sigmas[SCALE] > DOUBT_SCALE[others] * sensor.doubt
+    return contradicted
 
 
 def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:

@@ -130,6 +130,7 @@ PRIORS = np.array(CalibrationSettings().sigmas)
 PRIORS[3] = np.hypot(PRIORS[3], OdometrySettings().sigma_scale)
 """The scale of the ranges can only be seen beside that of the speeds."""
 SMALL = 3.0 * np.hypot(SIGMA, PRIORS)
+SMALL[3] *= 0.8
 """Three sigmas of measurement and prior together do not contradict the prior, and five do."""
 
 
@@ -178,6 +179,15 @@ def test_the_ranges_keep_their_scale_as_long_as_it_is_known(
     before = SETTINGS.calibration
     kept = (found.calibration.range_scale, found.calibration.sigma_range_scale)
     assert (kept == (before.range_scale, before.sigma_range_scale)) == known
+
+
+@pytest.mark.parametrize(("yaw", "sigmas"), [(0.0, 3.2), (0.05, 2.0)])
+def test_a_wrong_scale_is_likelier_of_a_sensor_with_another_error(yaw: float, sigmas: float) -> None:
+    off = sigmas * np.hypot(SIGMA[3], PRIORS[3])
+    for share, known in ((0.95, True), (1.05, False)):
+        errors = np.array([yaw, 0.0, 0.0, share * off, 0.0])
+        found = learner(noise(errors), cones=True).calibrated(SETTINGS)
+        assert found.odometry.hold_scale != known
 
 
 def test_a_stated_scale_of_the_ranges_is_the_prior_from_the_first_cycle() -> None:
