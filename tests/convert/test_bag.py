@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pathspace_graph.cli import main
-from pathspace_graph.convert.bag import with_yaw_rate
+from pathspace_graph.convert.twists import with_yaw_rate
 from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.io.log import Detections, Log, read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
@@ -417,17 +417,10 @@ def test_clocks_that_differ_are_told_and_mended_by_the_time_of_receipt(
     assert len(convert(bag, tmp_path / "log", "--received").cycles) == 1
 
 
-MENDED = {
-    "rosbag1": "rosbag reindex {file} saves",
-    "mcap": "mcap recover {file} -o {folder}/recovered.mcap saves",
-    "sqlite3": "sqlite3 {file} .recover | sqlite3 {folder}/recovered.db3 saves",
-}
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.99])
 @pytest.mark.parametrize("folder", [False, True])
-def test_a_recording_that_was_cut_off_is_refused_with_the_command_that_mends_it(
+def test_a_recording_that_was_cut_off_is_refused(
     kind: Kind, share: float, folder: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def make(messages: Messages) -> list[Written]:
@@ -437,26 +430,7 @@ def test_a_recording_that_was_cut_off_is_refused_with_the_command_that_mends_it(
     file = next(one for one in (bag, *bag.glob("*.*")) if one.suffix in (".bag", ".mcap", ".db3"))
     file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
     said = refused(bag if folder else file, tmp_path / "log", capsys, *TOPICS)
-    assert "cut off" in said
-    assert MENDED[kind].format(file=file, folder=file.parent) in said
-
-
-@pytest.mark.parametrize(
-    ("name", "command"),
-    [
-        ("a b.mcap.zstd", "zstd -d '{folder}/a b.mcap.zstd' -o '{folder}/a b.mcap' gives the bag"),
-        ("d.db3.zst", "zstd -d {folder}/d.db3.zst -o {folder}/d.db3 gives the bag"),
-        ("d.bag.gz", "gunzip -k {folder}/d.bag.gz gives the bag"),
-        ("d.bag.active", "rosbag reindex {folder}/d.bag.active saves"),
-    ],
-)
-def test_a_file_that_is_compressed_or_was_not_finished_is_refused_with_a_command(
-    name: str, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")
-    for source in (tmp_path / name, tmp_path):
-        said = refused(source, tmp_path.parent / "log", capsys, *TOPICS)
-        assert command.format(folder=tmp_path) in said
+    assert "cut off" in said or "damaged" in said
 
 
 def test_a_bag_of_one_moment_is_told_without_a_rate(
@@ -490,7 +464,7 @@ def test_a_bag_that_was_played_in_a_loop_is_refused_until_the_times_of_receipt_a
     bag = write_bag(tmp_path, kind, make)
     said = refused(bag, tmp_path / "log", capsys, *TOPICS, *more)
     assert "the stamps fall back by 2.9 s at message 31" in said
-    assert len(convert(bag, tmp_path / "log", "--received", *more).odometry.t) in (59, 60)
+    assert len(convert(bag, tmp_path / "log", "--received", "--held", *more).odometry.t) in (59, 60)
 
 
 def test_a_sensor_of_another_frame_is_told_until_its_mounting_is_stated(
@@ -706,4 +680,4 @@ def test_without_the_package_one_line_says_how_to_install_it(
     bag = written(tmp_path, lambda messages, t: messages.odometry(t, TWIST))
     monkeypatch.setitem(sys.modules, "rosbags", None)
     line = refused(bag, tmp_path / "log", capsys, *TOPICS)
-    assert "pip install -e '.[ros]'" in line
+    assert "pip install 'pathspace-graph[ros]'" in line

@@ -284,7 +284,7 @@ def test_cones_without_a_header_are_those_with_one(
     rng = np.random.default_rng(seed)
     lines = eufs_text(generate_track(rng), rng).splitlines()
     rows = [",".join(f"{line},0.01,0.01,0".split(",")[:columns]) for line in lines[1:]]
-    names = ",".join("tag,x,y,direction,x_variance,y_variance,xy_covariance".split(",")[:columns])
+    names = ",".join(["tag", "x", "y", "direction", "x_variance", "y_variance", "xy_covariance"][:columns])
     with_header, without = tmp_path / "with.csv", tmp_path / "without.csv"
     with_header.write_bytes(ends.join([names, *rows, ""]).encode())
     without.write_bytes(ends.join([*rows, ""]).encode())
