@@ -11,7 +11,7 @@ from multiprocessing import active_children
 from traceback import print_exc
 from typing import Any, Final, NamedTuple
 
-from .errors import PathspaceError, SolveError, check_name
+from .errors import PathspaceError, SolveError, check_name, install
 
 PROGRAM: Final = "pathspace-graph"
 DONE, BAD_INPUT, NOT_SOLVED, INTERRUPTED, BROKEN_PIPE, TERMINATED = 0, 2, 3, 130, 141, 143  # exit codes
@@ -72,8 +72,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if error.name not in EXTRAS:
             raise
-        install = f"pip install -e '.[{EXTRAS[error.name]}]'"
-        return _refuse(f"expected the package {error.name} ({install}), found none", level)
+        way = install(EXTRAS[error.name])
+        return _refuse(f"expected the package {error.name} ({way}), found none", level)
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE

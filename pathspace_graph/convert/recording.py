@@ -136,13 +136,13 @@ def strays(t: Array) -> BoolArray:
 
 def without_strays(record: Recording) -> Recording:
     """Leave out what has a stamp far from those around it, as a first message of a clock that isn't set."""
-    of_odometry, of_scans = strays(record.t), strays(record.scan_t)
+    of_odometry, of_scans, notes = strays(record.t), strays(record.scan_t), record.notes
     if of_odometry.any():
         where = record.at(record.numbers[of_odometry])
         far = "odometry samples have a stamp far from those around them, and were left out"
-        record.notes[f"{far}: {where}"] += int(of_odometry.sum())
+        notes[f"{far}: {where}"] += int(of_odometry.sum())
     far = "messages with detections have a stamp far from those around them, and were left out"
-    record.notes[far] += int(of_scans.sum())
+    notes[far] += int(of_scans.sum())
     return record.chosen(~of_odometry, ~of_scans)
 
 
@@ -258,9 +258,10 @@ def _from_poses(
         unit = " (--units angle=deg)" * bool(record.units)
         raise InputError(file, f"expected the yaw of poses in rad, {found}: is it in degrees{unit}?")
     new = twists.measured_anew(t, poses)
-    record.notes["odometry samples repeat the pose before them, and were left out"] += int((~new).sum())
+    notes = record.notes
+    notes["odometry samples repeat the pose before them, and were left out"] += int((~new).sum())
     t, poses, rows = t[new], poses[new], rows[new]
-    record.notes["odometry samples are differences of poses, whose noise is not white"] += len(t) - 1
+    notes["odometry samples are differences of poses, whose noise is not white"] += len(t) - 1
     return t[:-1], twists.twists_between(t, poses), rows[:-1]
 
 
@@ -280,7 +281,9 @@ def _possible(record: Recording, t: Array, values: Array, rows: IntArray, file: 
         where = record.at(rows[first : first + 1])
         raise InputError(file, f"expected {limits}, found {found} in {where}: is the unit right{unit}?")
     jumped = (off != 0.0).any(axis=1)
-    wrong = beyond.any(axis=1) | (jumped if jumped.mean() <= twists.MOST_WRONG else False)
+    wrong = beyond.any(axis=1)
+    if jumped.sum() <= max(twists.MOST_WRONG * len(t), twists.FEW):  # else it is how this odometry is
+        wrong = wrong | jumped
     if not wrong.any():
         return np.asarray(~wrong)
     first = int(np.argmax(wrong))
@@ -292,9 +295,9 @@ def _possible(record: Recording, t: Array, values: Array, rows: IntArray, file: 
     cause = "a position jumps" if column < 2 else "a value jumps"
     if column == 2 and min(abs(turn - 1.0), abs(turn - 2.0)) < 1.0 - twists.WRAP_SHARE:
         cause = "the yaw was differenced where it wraps by a whole turn"
-    told = "odometry samples can't be, and were left out as a gap"
-    record.notes[f"{told}: {_told(values[first], column)}, where {cause}, in {record.at(rows[wrong])}"] += (
-        int(wrong.sum())
+    told, notes = "odometry samples can't be, and were left out as a gap", record.notes
+    notes[f"{told}: {_told(values[first], column)}, where {cause}, in {record.at(rows[wrong])}"] += int(
+        wrong.sum()
     )
     return np.asarray(~wrong)
 
@@ -389,13 +392,13 @@ def distinct(found: Points, notes: Counter[str]) -> Points:
     return found.where(np.delete(np.arange(len(order)), repeats))
 
 
-def pairs_of_cones(points: Array) -> IntArray:
-    """Pairs (k, 2) of points (m, 2) that are nearest to one another, and far from all others."""
+def pairs_of_cones(points: Array, most: float | None = None) -> IntArray:
+    """Pairs (k, 2) of points (m, 2) nearest to one another, and far from all others, or `most` apart (m)."""
     if len(points) < 3:
         return np.zeros((0, 2), int)
     found = KDTree(points).query(points, 3)
     (_, first, second), (_, other, _) = np.asarray(found[0]).T, np.asarray(found[1]).T
-    own, close = np.arange(len(points)), first < PAIRED * second
+    own, close = np.arange(len(points)), first < (PAIRED * second if most is None else most)
     mutual = close & close[other] & (other[other] == own) & (own < other)
     return np.asarray(np.column_stack([own, other])[mutual])
 
@@ -403,14 +406,13 @@ def pairs_of_cones(points: Array) -> IntArray:
 def merged_pairs(scans: list[Points], notes: Counter[str]) -> list[Points]:
     """Merge two detections of each cone to their mean, where most cones were reported twice."""
     pairs = [pairs_of_cones(scan.points) for scan in scans]
-    paired, total = 2 * sum(map(len, pairs)), sum(len(scan.labels) for scan in scans)
-    if paired <= MOST_PAIRED * total:
+    if 2 * sum(map(len, pairs)) <= MOST_PAIRED * count(scans):
         return scans
-    apart = [
-        np.hypot(*np.diff(scan.points[two], axis=1)[:, 0].T) for scan, two in zip(scans, pairs, strict=True)
-    ]
-    usual = float(np.median(np.concatenate(apart)))
-    notes[f"detections lie in pairs, {usual:.2g} m apart, and were merged to one a cone"] += paired
+    ends = [scan.points[two] for scan, two in zip(scans, pairs, strict=True)]
+    usual = float(np.median(np.concatenate([np.hypot(*(two[:, 1] - two[:, 0]).T) for two in ends])))
+    pairs = [pairs_of_cones(scan.points, 2.0 * usual) for scan in scans]
+    told = f"detections lie in pairs, {usual:.2g} m apart, and were merged to one a cone"
+    notes[told] += 2 * sum(map(len, pairs))
     merged = []
     for scan, two in zip(scans, pairs, strict=True):
         one, other = two.T
@@ -471,8 +473,13 @@ class MessageStream:
         self._waiting = list[Detections]()  # in order of their stamps
         self._newest = -np.inf  # the stamp (s) of the newest message with detections
 
-    def take_odometry(self, message: Any, received: float) -> None:
-        """Buffer the twist of a message that was received at this time (s)."""
+    @property
+    def newest_twist(self) -> Array:
+        """The newest twist (3,) in m/s, m/s and rad/s."""
+        return np.array(self._twists[-1][1])
+
+    def take_odometry(self, message: Any, received: float) -> bool:
+        """Buffer the twist of a message that was received at this time (s); return whether it is usable."""
         try:
             t, twist = stamp_of(message) or received, twist_of(message)
             if twist is None:
@@ -486,6 +493,8 @@ class MessageStream:
             self._first = min(self._first, t)
         except BROKEN as error:
             self.refused[str(error)] += 1
+            return False
+        return True
 
     def take_detections(self, message: Any, received: float) -> Iterator[tuple[Odometry, Detections]]:
         """Yield the cycles that have waited for long enough, with the twists since the last in `use`."""

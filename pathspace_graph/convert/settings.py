@@ -55,7 +55,7 @@ class BagOptions:
     from_poses: bool = False
     """Make the twists from the poses of the odometry, for a publisher that leaves its twist zero."""
     held: bool = False
-    """Each twist is the mean until the next one. Without it twists are samples, and those slower than 20 Hz
+    """Each twist is the mean until the next one. Without it twists are samples, and those slower than 8 Hz
     are interpolated."""
     received: bool = False
     """Use the times of receipt as stamps, even where messages have their own."""

@@ -58,8 +58,8 @@ MAX_BEARING: Final = 2.0 * pi  # largest bearing (rad); more are degrees
 LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are large
 MANY_ROWS: Final = 20  # number of rows from which nanoseconds are checked
 LEAST_NANOSECONDS: Final = 1e6  # that fractions of so many rows reach
-MIN_PERIOD: Final = 1e-5  # least mean period of samples (s); less is a wrong unit of time
-MAX_PERIOD: Final = 1e3  # largest mean period of samples (s); more is a wrong unit of time
+MIN_PERIOD: Final = 1e-5  # least median period of samples (s); less is a wrong unit of time
+MAX_PERIOD: Final = 1e3  # largest median period of samples (s); more is a wrong unit of time
 
 
 def read_csv(
@@ -245,7 +245,7 @@ class _File:
             f"{unit} (--units time=ns)?",
         )
         stamps, expected = np.unique(t), f"expected stamps in {unit} in column '{name}'"
-        period = float(np.ptp(stamps)) / max(len(stamps) - 1, 1)
+        period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
         if len(stamps) > 1 and not MIN_PERIOD < period < MAX_PERIOD:
             found = f"found them {period:.3g} s apart: is their unit another one?"
             raise InputError(self.table.file, f"{expected}, {found}")

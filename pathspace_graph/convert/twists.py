@@ -19,9 +19,11 @@ NOISE_SIGMAS: Final = 6.0  # noise of a row that may leave the medians around it
 MAD: Final = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 WRAP_SHARE: Final = 0.7  # share of half a turn in a row that marks a yaw that was differenced where it wraps
 MOST_WRONG: Final = 0.05  # largest share of rows that are mistakes of single rows
+FEW: Final = 6  # number of rows that jump that are mistakes in any record
 FROZEN: Final = 1.2  # longest time (s) for which a repeated pose is one that was not measured anew
 MANY: Final = 20  # number of samples from which their period is known
-PERIOD: Final = 0.05  # longest period (s) of twists that are held; slower ones are interpolated
+SLOW: Final = 0.12  # longest period (s) of sampled twists that are held; slower ones are interpolated
+PERIOD: Final = 0.05  # longest part (s) of an interval that is interpolated
 GAP: Final = 2.5  # a longer interval, in median ones, is a gap, over which nothing is interpolated
 
 
@@ -96,7 +98,8 @@ def jumps(t: Array, twists: Array) -> Array:
 def parts_of(t: Array) -> int:
     """Number of parts of an interval of sampled twists at t (n,) in s, each `PERIOD` long at most."""
     steps = np.diff(np.unique(t[np.isfinite(t)]))
-    return int(np.ceil(np.median(steps) / PERIOD - 1e-6)) if len(steps) >= MANY else 1
+    period = float(np.median(steps)) if len(steps) >= MANY else 0.0
+    return int(np.ceil(period / PERIOD - 1e-6)) if period > SLOW else 1
 
 
 def interpolated(t: Array, twists: Array, parts: int) -> Odometry:
