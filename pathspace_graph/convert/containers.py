@@ -33,6 +33,7 @@ READABLE: Final = (
 MOST_BEGIN: Final = 512  # number of bytes that tell what a file is
 MOST_NAMED: Final = 8  # number of topics or tables that are named
 MOST_RECORDS: Final = 10_000  # number of records of an MCAP file that are searched for its topics
+FOOTER_BYTES: Final = 37  # of the last record of an MCAP file with what is around it
 HEADER, FOOTER, SCHEMA, CHANNEL = 1, 2, 3, 4  # kinds of records of an MCAP file
 
 
@@ -71,9 +72,9 @@ def described_text(begin: bytes) -> str:
 
 def described_mcap(stream: BinaryIO) -> str:
     """Say which messages an MCAP file holds, by the records of its summary."""
-    stream.seek(-37, 2)
+    stream.seek(max(stream.seek(0, 2) - FOOTER_BYTES, 0))
     end = stream.read()
-    if not end.endswith(MCAP) or end[0] != FOOTER:
+    if len(end) < FOOTER_BYTES or not end.endswith(MCAP) or end[0] != FOOTER:
         return "an MCAP file that was cut off or is damaged"
     (summary,) = struct.unpack("<Q", end[9:17])
     stream.seek(len(MCAP))

@@ -681,3 +681,65 @@ def test_without_the_package_one_line_says_how_to_install_it(
     monkeypatch.setitem(sys.modules, "rosbags", None)
     line = refused(bag, tmp_path / "log", capsys, *TOPICS)
     assert "pip install 'pathspace-graph[ros]'" in line
+
+
+# --- markers ---------------------------------------------------------------------------------------------
+
+
+def in_namespaces(
+    log: Log, names: tuple[str, ...], offset: float = 0.0, second: int = 2
+) -> Callable[[Messages], list[Written]]:
+    """Markers of a log's cones, in each namespace one; those of all but the first are beside it and grey."""
+
+    def markers(messages: Messages, cycle: Detections) -> Any:
+        made = []
+        for point, label in zip(cycle.points_vehicle, cycle.labels.tolist(), strict=True):
+            for number, name in enumerate(names):
+                colour = colour_of(label if number == 0 else 2)
+                kind = 3 if number == 0 else second
+                made.append(
+                    messages.marker(cycle.t, (point[0], point[1] + number * offset), colour, kind=kind)
+                )
+                made[-1].ns = name
+        return messages.markers(made[::-1])  # the grey ones first
+
+    return of_log(log, markers)
+
+
+@pytest.mark.parametrize("names", [("cones", "covariance"), ("a", "b", "c"), ("same", "same")])
+def test_markers_at_one_place_are_one_detection(
+    names: tuple[str, ...], drive: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    count = sum(len(cycle.labels) for cycle in drive.cycles)
+    log = convert(write_bag(tmp_path, "mcap", in_namespaces(drive, names)), tmp_path / "log")
+    said = capsys.readouterr()
+    for found, cycle in zip(log.cycles, drive.cycles, strict=True):
+        order = np.argsort(found.points_vehicle[:, 0]), np.argsort(cycle.points_vehicle[:, 0])
+        np.testing.assert_allclose(found.points_vehicle[order[0]], cycle.points_vehicle[order[1]])
+        assert found.labels[order[0]].tolist() == cycle.labels[order[1]].tolist()
+    assert f"{(len(names) - 1) * count} detections were at the place of another one" in said.out
+    assert ("namespaces of markers were read together" in said.out) == (len({*names}) > 1)
+    assert "Warning" not in said.err
+
+
+def test_a_namespace_is_chosen(drive: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What was filtered lies half a metre beside what was detected."""
+    bag = write_bag(tmp_path, "mcap", in_namespaces(drive, ("raw", "filtered"), 0.5))
+    count = sum(len(cycle.labels) for cycle in drive.cycles)
+    log = convert(bag, tmp_path / "log", "--namespaces", "raw")
+    assert sum(len(cycle.labels) for cycle in log.cycles) == count
+    assert {label for cycle in log.cycles for label in cycle.labels.tolist()} == {LEFT, RIGHT}
+    assert "namespaces" not in capsys.readouterr().out
+    said = refused(bag, tmp_path / "other", capsys, *TOPICS, "--namespaces", "cones")
+    assert f"expected one of 'filtered' ({count} markers), 'raw' ({count} markers), found 'cones'" in said
+
+
+def test_two_detections_of_each_cone_are_merged(
+    drive: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_bag(tmp_path, "mcap", in_namespaces(drive, ("left_camera", "right_camera"), 0.4))
+    log = convert(bag, tmp_path / "log")
+    assert "detections lie in pairs, 0.4 m apart, and were merged to one a cone" in capsys.readouterr().out
+    counts = [len(cycle.labels) for cycle in log.cycles], [len(cycle.labels) for cycle in drive.cycles]
+    assert sum(counts[0]) < 1.02 * sum(counts[1])
+    assert {label for cycle in log.cycles for label in cycle.labels.tolist()} == {LEFT, RIGHT}
