@@ -103,7 +103,7 @@ class Bridge:
     def map_T_odometry(self, result: CycleResult) -> Array | None:
         """Pose (3,) of the odometry's frame in the map at a cycle; None where the odometry has no pose.
 
-        map_T_odom = map_T_vehicle (odom_T_vehicle exp(dt twist))^-1
+        It is `map_T_odom = map_T_vehicle (odom_T_vehicle exp(dt twist))^-1`, in m, m and rad.
         """
         before = [one for one in self._odometry if one[0] <= result.t]
         if not before:
