@@ -15,7 +15,7 @@ from typing import Any, Final, Literal, NamedTuple, cast, get_args
 import cyclopts
 from cyclopts import App, ArgumentCollection
 
-from .errors import PathspaceError, SolveError, check_name
+from .errors import PathspaceError, SolveError, check_name, install
 
 PROGRAM: Final = "pathspace-graph"
 DONE, BAD_INPUT, NOT_SOLVED, INTERRUPTED, BROKEN_PIPE, TERMINATED = 0, 2, 3, 130, 141, 143  # exit codes
@@ -80,8 +80,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if error.name not in EXTRAS:
             raise
-        install = f"pip install -e '.[{EXTRAS[error.name]}]'"
-        return _refuse(f"expected the package {error.name} ({install}), found none", words)
+        way = install(EXTRAS[error.name])
+        return _refuse(f"expected the package {error.name} ({way}), found none", words)
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE

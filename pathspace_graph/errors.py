@@ -71,6 +71,11 @@ def solving(what: str) -> Iterator[None]:
         raise SolveError(f"{what} has failed: {type(error).__name__}: {error}") from error
 
 
+def install(extra: str) -> str:
+    """Command that installs the packages of an extra beside this one, from a wheel or a checkout."""
+    return f"pip install 'pathspace-graph[{extra}]'"
+
+
 MAX_INTEGER: Final = 2**63 - 1  # in a file or on the command line
 LEAST_BEGIN: Final = 3  # least number of letters of a prefix that suggests a name
 NAME_SIMILARITY: Final = 0.6  # least similarity (0 to 1) of a suggested name

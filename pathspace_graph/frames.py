@@ -11,7 +11,7 @@ import pandas as pd
 from pathspace_graph.io.parsing import MAX_STAMP, Table, read_table
 from pathspace_graph.io.results import CYCLE_COLUMNS, CYCLES_FILE, RunResult
 
-from .errors import InputError, SettingsError
+from .errors import InputError, SettingsError, install
 
 if TYPE_CHECKING:
     import xarray
@@ -80,7 +80,7 @@ def to_dataset(study: pd.DataFrame) -> xarray.Dataset:
     attributes. SettingsError if xarray is not installed.
     """
     if find_spec("xarray") is None:
-        raise SettingsError("to_dataset: expected xarray (pip install -e '.[frames]'), found none")
+        raise SettingsError(f"to_dataset: expected xarray ({install('frames')}), found none")
     numbers = study.select_dtypes(["number", "bool", "boolean"]).columns.difference(DIMENSIONS, sort=False)
     finished = study[study["lap"].notna()].astype({"lap": "int64", **dict.fromkeys(numbers, "float64")})
     dataset: xarray.Dataset = finished.set_index(list(DIMENSIONS))[list(numbers)].to_xarray()

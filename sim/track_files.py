@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io import parsing as limits
-from pathspace_graph.io.parsing import Table, parse_yaml, read_table, read_text, typed
+from pathspace_graph.io.parsing import Table, is_number, parse_yaml, read_table, read_text, shown, typed
 from pathspace_graph.labels import BIG_ORANGE, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
@@ -35,6 +35,9 @@ WIDTH_STEP: Final = 0.5  # distance of samples of a circuit (m)
 TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # centre line and widths
 EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
 """EUFS tags of cones of no boundary; further tags, such as midpoint, are no cones."""
+EUFS_TAGS: Final = ("blue", "yellow", *EUFS_OTHER, "car_start", "midpoint")
+EUFS_COLUMNS: Final = ("tag", "x", "y", "direction", "x_variance", "y_variance", "xy_covariance")
+"""Columns of an EUFS file in their order, which FSDS writes without a header."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,10 @@ def read_track(path: Path | str) -> Track:
             _check(path, track)
             return track
     kinds = ", ".join(known.description for known in FORMATS)
-    raise InputError(path, f"expected a track file of a known kind: {kinds}")
+    expected = f"expected a track file of a known kind: {kinds}"
+    if path.suffix.lower() == ".csv":
+        raise InputError(path, f"{expected}, found {shown(_first_row(path))}", 1)
+    raise InputError(path, expected)
 
 
 def _check(path: Path, track: Track) -> None:
@@ -198,7 +204,18 @@ def _without_repeats(row: Array, closed: bool) -> Array:
 
 
 def _parse_csv(path: Path) -> Table:
-    return read_table(path, (), comment="#", most=limits.MAX_TRACK_BYTES)
+    return read_table(path, (), "#", limits.MAX_TRACK_BYTES, header=_missing_header(path))
+
+
+def _first_row(path: Path) -> str:
+    return next(filter(str.strip, read_text(path, most=limits.MAX_TRACK_BYTES).split("\n")), "").strip()
+
+
+def _missing_header(path: Path) -> tuple[str, ...]:
+    """Columns of a file of cones without a header: its first row is a cone; none of any other file."""
+    tag, *numbers = (part.strip(' "') for part in _first_row(path).split(","))
+    is_cone = tag.lower() in EUFS_TAGS and len(numbers) >= 2 and all(map(is_number, numbers[:2]))
+    return EUFS_COLUMNS[: 1 + len(numbers)] if is_cone else ()
 
 
 def _is_tum(table: Table) -> bool:
@@ -210,7 +227,7 @@ def _is_eufs(table: Table) -> bool:
 
 
 def _eufs(path: Path, _: Table) -> Track:
-    table = read_table(path, ("tag", "x", "y"))
+    table = read_table(path, ("tag", "x", "y"), header=_missing_header(path))
     tags = np.array([tag.strip().lower() for tag in table.columns["tag"]])
     points = table.stack(("x", "y"))
     if len(points) > 2 * limits.MAX_CONES:
@@ -301,7 +318,7 @@ FORMATS: Final = (
     TrackFormat(
         "fssim YAML (cones_left, cones_right, starting_pose_front_wing)", YAML, _parse_yaml, _is_fssim, _fssim
     ),
-    TrackFormat("EUFS CSV (tag,x,y,direction)", (".csv",), _parse_csv, _is_eufs, _eufs),
+    TrackFormat("EUFS and FSDS CSV (tag,x,y,direction)", (".csv",), _parse_csv, _is_eufs, _eufs),
     TrackFormat("TUM CSV (# x_m,y_m,w_tr_right_m,w_tr_left_m)", (".csv",), _parse_csv, _is_tum, _tum),
 )
 """The first format that recognizes a file reads it; docs/estimators.md shows how a format is added."""

@@ -28,7 +28,7 @@ def example(name: str) -> ModuleType:
 
 def test_every_example_has_a_test() -> None:
     tested = {"carmen", "gnss", "surveyed_point", "look_at_graph"}
-    tested |= {"ros2_node", "write_bag"}  # in tests/convert, and by the tutorial
+    tested |= {"write_bag"}  # by the tutorial
     assert {file.stem for file in EXAMPLES.glob("*.py")} == tested
 
 

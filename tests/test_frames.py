@@ -111,6 +111,6 @@ def test_a_dataset_has_a_value_for_each_run_and_lap(study: Path) -> None:
 
 def test_without_xarray_one_line_says_how_to_install_it(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pathspace_graph.frames.find_spec", lambda name: None)
-    with pytest.raises(SettingsError, match=r"pip install -e '\.\[frames\]'"):
+    with pytest.raises(SettingsError, match=r"pip install 'pathspace-graph\[frames\]'"):
         to_dataset(read_study(study))
     assert importlib.util.find_spec("xarray") is not None

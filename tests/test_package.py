@@ -132,7 +132,7 @@ def test_a_command_without_its_extra_says_how_to_install_it() -> None:
     run = "from pathspace_graph.cli import main; sys.exit(main(['compare', 'log', '--out', 'out']))"
     code = f"import sys; sys.modules['pandas'] = None; {run}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    said = "pathspace-graph: expected the package pandas (pip install -e '.[eval]'), found none\n"
+    said = "pathspace-graph: expected the package pandas (pip install 'pathspace-graph[eval]'), found none\n"
     assert (done.returncode, done.stderr) == (2, said)
 
 
@@ -178,6 +178,12 @@ import pathspace_graph.eval.metrics.accuracy, pathspace_graph.eval.figures.map_p
 import pathspace_graph.eval.benchmark.scaling
 """
     assert "pathspace_graph.eval.figures.map_plot" in modules_after(code)
+
+
+def test_each_script_is_a_function() -> None:
+    for target in PROJECT["project"]["scripts"].values():
+        module, _, name = target.partition(":")
+        assert callable(getattr(import_module(module), name)), target
 
 
 # --- README ----------------------------------------------------------------------------------------------

@@ -13,7 +13,8 @@ import pytest
 from .scenes.paths import PACKAGE, ROOT, modules, room_of
 
 MOST_FILES = 15
-EXTRAS = {"distributed", "rerun", "rosbags"}
+ROS = {"rclpy", *(f"{name}_msgs" for name in ("geometry", "nav", "sensor", "std", "tf2", "visualization"))}
+EXTRAS = {"distributed", "rerun", "rosbags", "builtin_interfaces"} | ROS
 """Optional packages, which are imported only where they are needed."""
 
 LATE = {
@@ -68,6 +69,7 @@ ARROWS: dict[str, set[str]] = {
     | {"convert", "frames", "options"}
     | {"eval"}
     | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "benchmark", "view")},
+    "ros": BELOW_ESTIMATORS | {"convert", "online", "loop"},
     "frames": {"io"},
     "cli": {"commands", "options"},
     "__main__": {"cli"},
@@ -188,6 +190,14 @@ ASSIGNED = {
     "baselines.landmark_fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
     "mapping.road": {"self.smoother.attached"},
     "mapping.smoother": {"self.window.exact"},
+    "ros.node": {f"marker.{part}" for part in ("ns", "id", "type", "points", "scale.x", "pose.orientation.w")}
+    | {
+        "colour.a",
+        "position.x",
+        "position.y",
+        "orientation.z",
+        "orientation.w",
+    },  # of messages, which are filled in
     "snapshot": {"array.flags.writeable"},  # of numpy
 }
 """Attributes that a module assigns to objects of others: no module may have another one."""

@@ -16,7 +16,7 @@ from typing import Any, Final, TypeVar
 from joblib import Parallel, delayed, parallel_config
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.errors import InputError, SettingsError, install
 from pathspace_graph.io.files import atomic_folder, to_plain, write_json, write_text
 from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.parsing import read_json
@@ -204,7 +204,7 @@ def workers(jobs: int = 1, cluster: str | None = None) -> Iterator[None]:
     try:
         from distributed import Client  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise SettingsError("--cluster: expected dask (pip install -e '.[cluster]'), found none") from error
+        raise SettingsError(f"--cluster: expected dask ({install('cluster')}), found none") from error
     try:
         client = Client(cluster, timeout=CONNECT_SECONDS)
     except (OSError, ValueError) as error:

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import SettingsError, install
 from pathspace_graph.eval.figures import style
 from pathspace_graph.eval.figures.map_plot import BOUNDARY_COLORS, HEALTH_COLORS, TRAJECTORY_COLOR
 from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, LIGHT, ORANGE, RED
@@ -38,8 +38,8 @@ def import_rerun(option: str) -> Any:
         import rerun  # noqa: PLC0415
         import rerun.blueprint  # noqa: PLC0415
     except ImportError as error:
-        install = "pip install -e '.[view]'"
-        raise SettingsError(f"{option}: expected the package rerun-sdk, found none; {install}") from error
+        told = f"{option}: expected the package rerun-sdk, found none; {install('view')}"
+        raise SettingsError(told) from error
     return rerun
 
 

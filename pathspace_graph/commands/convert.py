@@ -1,9 +1,10 @@
 """`convert`: a ROS bag, CSV files or JSON lines as a log."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -12,27 +13,42 @@ from pathspace_graph.convert.bag import read_bag
 from pathspace_graph.convert.recording import Recording, rate, to_log, windowed
 from pathspace_graph.convert.settings import LabelRule
 from pathspace_graph.convert.text_files import read_csv, read_json_lines
-from pathspace_graph.errors import InputError, PathspaceError
-from pathspace_graph.front_end.front_end import measure_log
+from pathspace_graph.errors import InputError, PathspaceError, SettingsError
+from pathspace_graph.front_end.front_end import seen_cycles
+from pathspace_graph.front_end.gate import check_usable
+from pathspace_graph.front_end.noise import measure
+from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.files import check_target
-from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE, Log, write_log
+from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE, Log, Odometry, write_log
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.options.data import Convert
 from pathspace_graph.plausibility.diagnosis import measured_line
-from pathspace_graph.plausibility.hint import because
+from pathspace_graph.plausibility.hint import Hint, because
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.online import LimitSettings
 
 from .estimate import tell
 from .outcome import Outcome
 from .simulate import describe
 
 SUFFIXES: Final = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json")}  # of records in a folder
+OF_KIND: Final = {  # kinds of records that take an option; any other option is for all of them
+    **dict.fromkeys(("odometry", "detections"), ("bag", "csv")),
+    **dict.fromkeys(("imu", "wheelbase", "definition", "received", "namespaces", "label_field"), ("bag",)),
+    **dict.fromkeys(("columns", "units"), ("csv",)),
+}
+UNITS_OPTION: Final = {  # option of `convert` that mends a cause of a hint about CSV files
+    **{"stamps": "--units time=ms", "positions": "--units length=mm"},
+    **{"speeds": "--units speed=km/h", "yaw rate": "--units yaw_rate=deg/s"},
+    "unexplained": "--units angle=deg",
+}
 
 
 def convert_command(options: Convert) -> Outcome:
+    _check_kind(options)
     records = _records(options)
     if not records:
         _convert(options, options.source, options.out)
@@ -49,6 +65,15 @@ def convert_command(options: Convert) -> Outcome:
         some = f"{len(refused)} of {len(records)} records were refused"
         raise PathspaceError(f"{some}: {'; '.join(refused)}")
     return Outcome(written)
+
+
+def _check_kind(options: Convert) -> None:
+    """Raise a SettingsError for an option that the kind of the record would ignore."""
+    for name, kinds in OF_KIND.items():
+        given: Any = options if hasattr(options, name) else options.topics
+        if options.kind not in kinds and getattr(given, name) != getattr(type(given), name):
+            expected = f"expected --from {' or '.join(kinds)}"
+            raise SettingsError(f"--{name.replace('_', '-')}: {expected}, found {options.kind}")
 
 
 def _records(options: Convert) -> list[Path]:
@@ -70,49 +95,80 @@ def _convert(options: Convert, source: Path, out: Path) -> None:
     with progress("converting"):
         record = windowed(_read(options, source, rule), options.window, source)
         recorded = to_log(record, options.frames, options.noise, source, options.window.spacing)
-        log = with_measured_noise(recorded)
+        log = with_measured_noise(recorded, record.parts)
         write_checked(log, out, source, force=options.force)
     report(record.notes, rule, log)
-    tell(hints(log))
+    tell(_with_units(hints(log)) if options.kind == "csv" else hints(log))
 
 
 def _read(options: Convert, source: Path, rule: LabelRule) -> Recording:
     if options.kind == "jsonl":
-        return read_json_lines(source, rule)
+        return read_json_lines(source, rule, from_poses=options.topics.from_poses, held=options.topics.held)
     if options.kind == "csv":
-        files = options.topics.odometry or ODOMETRY_FILE, options.topics.detections or DETECTIONS_FILE
-        return read_csv(source / files[0], source / files[1], rule, options.columns, options.units)
+        topics = options.topics
+        files = topics.odometry or ODOMETRY_FILE, topics.detections or DETECTIONS_FILE
+        return read_csv(
+            source / files[0],
+            source / files[1],
+            rule,
+            options.columns,
+            options.units,
+            from_poses=topics.from_poses,
+            held=topics.held,
+        )
     return read_bag(source, options.topics, rule, mounted=options.frames.mounting is not None)
 
 
-def with_measured_noise(log: Log) -> Log:
-    """Measure the noise of a log where it is not stated."""
+def _with_units(found: Sequence[Hint]) -> list[Hint]:
+    """Name the option that states a unit beside each hint at a wrong one."""
+    return [
+        replace(hint, advice=f"{hint.advice} ({UNITS_OPTION[hint.cause]})")
+        if hint.cause in UNITS_OPTION
+        else hint
+        for hint in found
+    ]
+
+
+def with_measured_noise(log: Log, parts: int = 1) -> Log:
+    """Measure the noise of a log where it is not stated.
+
+    Of interpolated twists, `parts` of a sample, the white noise is that of the samples: each part has it
+    `sqrt(parts)` times, so that the parts of a sample move the vehicle as uncertainly as the sample held.
+    """
+    if log.odometry_stated:
+        log = replace(log, odometry_sigma=log.odometry_sigma * np.sqrt(parts))
     if log.odometry_stated and log.detections_stated:
         return log
     scale, settings = scale_of(log), MapperSettings(kind=log.sensor.kind)
-    measured = scaled(measure_log(scaled(log, 1.0 / scale), settings), scale)
+    at_one, samples = scaled(log, 1.0 / scale), TwistRecord()
+    samples.add(Odometry(at_one.odometry.t[::parts], at_one.odometry.twist[::parts]))
+    cycles, _ = seen_cycles(at_one, settings)
+    measured = measure(cycles, samples, of_lines=settings.kind == "line")
     if measured is None:
         return log
+    white = measured.odometry * np.sqrt(parts)
+    measured = scaled(replace(measured, odometry=white, interval=measured.interval / parts), scale)
     sigma = log.odometry_sigma if log.odometry_stated else measured.twist_sigma
     log = replace(log, measured=measured, odometry_sigma=sigma)
     if log.detections_stated:
         return log
-    cycles = []
-    for cycle in log.cycles:
-        covariances = measured.covariances(cycle.points_vehicle, inflated=False)
-        cycles.append(cycle if covariances is None else replace(cycle, covariances=covariances))
-    return replace(log, cycles=tuple(cycles))
+    known = ((cycle, measured.covariances(cycle.points_vehicle, inflated=False)) for cycle in log.cycles)
+    return replace(
+        log, cycles=tuple(cycle if K is None else replace(cycle, covariances=K) for cycle, K in known)
+    )
 
 
 def write_checked(log: Log, out: Path, source: Path, *, force: bool) -> None:
-    """Write a log; InputError of its source where reading it would fail."""
+    """Write a log; InputError of its source where an estimator could not use it."""
     try:
+        check_usable(log, out, LimitSettings())
         write_log(log, out, check=True, force=force)
     except InputError as error:
         where = f"{error.file.name}, row {error.row}" if error.row else error.file.name
         likely = because(hints(log))
         why = f"{error.message}; {likely}" if likely else error.message
-        raise InputError(source, f"its log would be refused ({where}): {why}") from None
+        part = "--start and --end take a part of the record"
+        raise InputError(source, f"its log would be refused ({where}): {why}; {part}") from None
 
 
 def report(notes: Counter[str], rule: LabelRule, log: Log) -> None:

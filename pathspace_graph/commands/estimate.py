@@ -278,14 +278,15 @@ def report(result: RunResult, log: Log) -> None:
     """Print the run, the paper's table where there is truth, and on standard error what was not mapped."""
     if laps := laps_of(result, log):
         output().print(laps_table(laps))
-    say(outline(result))
+    begin = float(log.odometry.t[0])  # a bag's stamps count from 1970
+    say(outline(result, begin))
     sides = {"line": "on both sides", "line-left": "on the left", "line-right": "on the right"}
     kind = result.settings.get("kind", "cones")
     if kind is None:
         say("too little was seen twice to tell cones from points of a line: cones are assumed")
     elif kind in sides:
         say(f"detections are points of a line {sides[kind]}, not of things that stay")
-    say(*(f"at {record.t:.1f} s: {record.notice}" for record in result.cycles if record.notice))
+    say(*(f"at {record.t - begin:.1f} s: {record.notice}" for record in result.cycles if record.notice))
     if result.batches is not None and result.batches.late:
         late = f"{result.batches.late} cycle{'' if result.batches.late == 1 else 's'}"
         say(f"in a vehicle the batch of the lap would have been {late} late")
@@ -296,8 +297,8 @@ def report(result: RunResult, log: Log) -> None:
         note("; ".join(missing))
 
 
-def outline(result: RunResult) -> str:
-    """Summary of the run in one line."""
+def outline(result: RunResult, begin: float = 0.0) -> str:
+    """Summary of the run in one line, with times since `begin` (s)."""
     laps = f"{result.laps} lap{'' if result.laps == 1 else 's'}"
     loop = "loop closed" if result.map.closed else "loop not closed"
     sizes = [f"{NAMES[label]} {boundary.size}" for label, boundary in sorted(result.map.boundaries.items())]
@@ -305,10 +306,10 @@ def outline(result: RunResult) -> str:
     orange = sorted(result.map.points.items())
     cones = [f"{own.size} {NAMES[label].replace('_', ' ')} cones" for label, own in orange]
     size = [] if result.scale == 1.0 else [f"{result.scale:g} times the size of a Formula Student track"]
-    return ", ".join([laps, loop, points, *cones, *size, *health_outline(result)])
+    return ", ".join([laps, loop, points, *cones, *size, *health_outline(result, begin)])
 
 
-def health_outline(result: RunResult) -> list[str]:
+def health_outline(result: RunResult, begin: float) -> list[str]:
     """Share of cycles that were not good, and why the vehicle is lost at the end."""
     number = counts([summary.health_of(record) for record in result.cycles])
     total = max(len(result.cycles), 1)
@@ -321,7 +322,7 @@ def health_outline(result: RunResult) -> list[str]:
     ]
     last = summary.stretches_of(result)[-1:]
     if last and last[0].health == LOST and last[0].end == result.cycles[-1].t:
-        parts.append(f"still lost since {last[0].begin:.1f} s ({last[0].reason})")
+        parts.append(f"still lost since {last[0].begin - begin:.1f} s ({last[0].reason})")
     return parts
 
 

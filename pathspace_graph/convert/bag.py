@@ -5,39 +5,36 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from shlex import quote
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pathspace_graph.errors import InputError, PathspaceError, SettingsError
+from pathspace_graph.errors import InputError, PathspaceError, SettingsError, install
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.parsing import read_text
 
-from .messages import MessageError, Points, frame_of, points_of, pose_of, stamp_of, twist_of, yaw_rate_of
-from .recording import Recording, check_clock, rate, twists_between
+from .containers import READABLE, described
+from .messages import (
+    MessageError,
+    Points,
+    frame_of,
+    namespaces_of,
+    points_of,
+    pose_of,
+    stamp_of,
+    twist_of,
+    yaw_rate_of,
+)
+from .recording import Recording, check_clock, rate
 from .settings import BagOptions, LabelRule
 
-INSTALL: Final = "pip install -e '.[ros]'"  # command that installs the package that reads bags
 SUPPORTED: Final = {  # contents that a message must have, by the option of its topic
     "--odometry": "a twist, a speed or a pose",
     "--imu": "an angular velocity",
     "--detections": "a point cloud, a scan, an array of markers, or a list of cones or polylines",
     "transforms": "transforms",
 }
-METADATA: Final = "metadata.yaml"  # file that describes the others in a folder of rosbag2
-DAMAGED: Final = "expected a ROS bag, found one that is compressed as a whole, or was cut off"
-DECOMPRESSED: Final = {  # commands that decompress a file, by its suffix
-    **dict.fromkeys((".zstd", ".zst"), "zstd -d {file} -o {inner}"),
-    **{".gz": "gunzip -k {file}", ".bz2": "bunzip2 -k {file}", ".lz4": "lz4 -d {file} {inner}"},
-}
-RECOVERED: Final = {  # commands that recover a file, by its first bytes
-    b"#ROSBAG V2": "rosbag reindex {file}",
-    b"\x89MCAP0\r\n": "mcap recover {file} -o {recovered}",
-    b"SQLite format 3": "sqlite3 {file} .recover | sqlite3 {recovered}",
-}
-LONGEST_MAGIC: Final = max(map(len, RECOVERED))
 STATIC: Final = "/tf_static"  # topic of the transforms between frames that are fixed to the vehicle
 BODIES: Final = ("base_link", "base_footprint")  # frames of a vehicle whose odometry names none
 LEVEL: Final = 0.98  # least cosine of a level sensor's z axis and the vehicle's
@@ -50,6 +47,7 @@ class Samples(NamedTuple):
     name: str  # topic and type of the messages
     t: Array  # (N,) stamps (s)
     values: list[Any]  # one for each message
+    numbers: Any  # (N,) number of each message in its topic, from 1
 
 
 class Motion(NamedTuple):
@@ -69,20 +67,48 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
         twist = twist_of(message, options.wheelbase)
         return Motion(twist, pose_of(message), frame_of(message), frame_of(message, "child_frame_id"))
 
+    namespaces = Counter[str]()
+
     def points(message: Any) -> tuple[str, Points]:
-        return frame_of(message), points_of(message, rule)
+        namespaces.update(namespaces_of(message))
+        return frame_of(message), points_of(message, rule, options.namespaces)
 
     with opened(path, options, notes) as bag:
         odometry = bag.samples(options.odometry, "--odometry", motion)
         imu = bag.samples(options.imu, "--imu", yaw_rate_of) if options.imu else None
         detections = bag.samples(options.detections, "--detections", points)
         static = [] if mounted else bag.transforms()
-    t, twists = _twists(odometry, imu, options, notes, path)
+    _check_namespaces(namespaces, options.namespaces, notes, path)
+    moved, are_poses = _motion(odometry, imu, options, path)
     mounting = None if mounted else _mounting(odometry, detections, static, notes, path)
     source = {"bag": path.name, "odometry": odometry.name, "detections": detections.name}
     source |= {} if imu is None else {"imu": imu.name}
-    scans = [scan for _, scan in detections.values]
-    return Recording(t, twists, detections.t, scans, source, notes, mounting=mounting)
+    return Recording(
+        odometry.t,
+        moved,
+        detections.t,
+        [scan for _, scan in detections.values],
+        source,
+        notes,
+        mounting=mounting,
+        are_poses=are_poses,
+        is_held=options.held,
+        imu=None if imu is None else (imu.t, np.array(imu.values)),
+        rows=odometry.numbers,
+        place=f"{options.odometry}, message",
+    )
+
+
+def _check_namespaces(found: Counter[str], chosen: Sequence[str], notes: Counter[str], path: Path) -> None:
+    """Note the namespaces of markers where there are several; InputError if a chosen one isn't there."""
+    listed = ", ".join(f"'{name}' ({count} markers)" for name, count in sorted(found.items()))
+    for name in chosen:
+        if name not in found:
+            raise InputError(
+                path, f"--namespaces: expected one of {listed or 'an array of markers'}, found '{name}'"
+            )
+    if len(found) > 1 and not chosen:
+        notes[f"namespaces of markers were read together: {listed} (--namespaces chooses)"] += len(found)
 
 
 # --- where the sensor is ---------------------------------------------------------------------------------
@@ -134,57 +160,28 @@ def transform_between(static: list[Any], body: str, sensor: str) -> Array | None
     return known.get(sensor)
 
 
-# --- twists ----------------------------------------------------------------------------------------------
+# --- motion ----------------------------------------------------------------------------------------------
 
 
-def _twists(
-    odometry: Samples, imu: Samples | None, options: BagOptions, notes: Counter[str], path: Path
-) -> tuple[Array, Array]:
-    """Stamps (n,) in s and twists (n, 3) of the vehicle."""
+def _motion(odometry: Samples, imu: Samples | None, options: BagOptions, path: Path) -> tuple[Array, bool]:
+    """Twists (N, 3) of the vehicle, with NaN for what an IMU gives, or its poses; and which of both."""
     measured = [motion.twist for motion in odometry.values if motion.twist is not None]
     poses = np.array([motion.pose for motion in odometry.values if motion.pose is not None])
     whole = len(poses) == len(odometry.values)
-    if options.from_poses or not measured or imu is not None:  # these are in order of time here
-        check_clock(odometry.t, "odometry", path)
+    if imu is not None:
+        check_clock(imu.t, "the IMU", path)
     if options.from_poses or not measured:
         if not whole:
             raise InputError(path, f"--from-poses: expected messages with a pose, found {odometry.name}")
-        t, first = np.unique(odometry.t, return_index=True)
-        if len(t) < 2:
-            raise InputError(path, f"--from-poses: expected two poses at least, found {len(t)}")
-        if not options.from_poses:
-            notes["odometry samples are differences of poses, whose noise is not white"] += len(t) - 1
-        t, twists = t[:-1], twists_between(t, poses[first])
-    else:
-        t, twists = odometry.t, np.array(measured)
-        if whole and not twists.any() and np.ptp(poses, axis=0).any():
-            found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
-            raise InputError(path, f"{odometry.name}: expected twists, {found}")
-    if imu is not None:
-        check_clock(imu.t, "the IMU", path)
-        return with_yaw_rate(t, twists, imu.t, np.array(imu.values))
-    if np.isnan(twists[:, 2]).all():
+        return poses, True
+    twists = np.array(measured)
+    if whole and not twists.any() and np.ptp(poses, axis=0).any():
+        found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
+        raise InputError(path, f"{odometry.name}: expected twists, {found}")
+    if imu is None and np.isnan(twists[:, 2]).all():
         expected = "expected --imu TOPIC for the yaw rate, or --wheelbase where there is a steering angle"
         raise InputError(path, f"{odometry.name}: {expected}, found neither")
-    return t, twists
-
-
-def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[Array, Array]:
-    """Replace the yaw rate of the twists by the mean of an IMU until the next twist."""
-    order, turn = np.argsort(t, kind="stable"), np.argsort(imu_t, kind="stable")
-    turn = turn[np.isfinite(rates[turn])]
-    t, twists, imu_t, rates = t[order], twists[order], imu_t[turn], rates[turn]
-    inside = (t >= imu_t[0]) & (t <= imu_t[-1]) if len(imu_t) else np.zeros(len(t), bool)
-    t, twists = t[inside], twists[inside]
-    if len(t) < 2:
-        return t, twists
-    heading = np.append(0.0, np.cumsum(rates[:-1] * np.diff(imu_t)))
-    steps, turned = np.diff(t), np.diff(np.interp(t, imu_t, heading))
-    last = rates[np.searchsorted(imu_t, t[-1], side="right") - 1]
-    mean = np.interp(t[:-1], imu_t, rates)  # where no time passes
-    np.divide(turned, steps, out=mean, where=steps > 0)
-    twists[:, 2] = np.append(mean, last)
-    return t, twists
+    return twists, False
 
 
 # --- bags ------------------------------------------------------------------------------------------------
@@ -200,31 +197,11 @@ def opened(path: Path, options: BagOptions, notes: Counter[str]) -> "Iterator[Ba
         reader = (rosbag1 if is_ros1(path) else rosbag2).Reader(path)
         reader.open()
     except Exception as error:
-        mended = "" if "support" in str(error) else way_to_mend(path)  # a newer bag is no damaged one
-        if mended:
-            raise InputError(path, f"{DAMAGED} ({error}): {mended}") from None
-        expected = "expected a ROS bag: a file .bag, .mcap or .db3, or a folder with metadata.yaml"
-        raise InputError(path, f"{expected} ({error}); --from states another kind") from None
+        raise InputError(path, f"expected a ROS bag, found {described(path)} ({error}); {READABLE}") from None
     try:
         yield Bag(path, reader, definitions, options.received, notes)
     finally:
         reader.close()
-
-
-def way_to_mend(path: Path) -> str:
-    """Command that mends a recording that was cut off or compressed, empty where none is known."""
-    if path.is_dir():
-        inside = (file for file in sorted(path.iterdir()) if file.is_file() and file.name != METADATA)
-        return next(filter(None, map(way_to_mend, inside)), "")
-    file, inner = quote(str(path)), quote(str(path.with_suffix("")))
-    recovered = quote(str(path.with_name(f"recovered{path.suffix}")))
-    places = {"file": file, "inner": inner, "recovered": recovered}
-    if path.suffix in DECOMPRESSED:
-        return f"{DECOMPRESSED[path.suffix].format(**places)} gives the bag to convert"
-    with path.open("rb") as stream:
-        begin = stream.read(LONGEST_MAGIC)
-    commands = [command for magic, command in RECOVERED.items() if begin.startswith(magic)]
-    return f"{commands[0].format(**places)} saves what can be read" if commands else ""
 
 
 @dataclass(frozen=True)
@@ -250,14 +227,14 @@ class Bag:
         stamped = [] if self.received else [k for k, stamp in enumerate(stamps) if stamp is not None]
         if 2 * len(stamped) <= len(stamps):
             self.notes[f"messages of {topic} have the time at which they were received"] += len(values)
-            return Samples(name, np.array(received), values)
+            return Samples(name, np.array(received), values, np.arange(len(values)) + 1)
         self.notes[f"messages of {topic} without a stamp were left out"] += len(stamps) - len(stamped)
         t = np.array([stamps[k] for k in stamped], dtype=float)
         late = float(np.median(np.array(received)[stamped] - t))
         if abs(late) > LATE:
             told = f"messages of {topic} were received {late:.3g} s after their stamps, in the median"
             self.notes[f"{told} (--received takes the times of receipt)"] += len(stamped)
-        return Samples(name, t, [values[k] for k in stamped])
+        return Samples(name, t, [values[k] for k in stamped], np.array(stamped) + 1)
 
     def transforms(self) -> list[Any]:
         """`TransformStamped`s between frames fixed to the vehicle, of which there may be none."""
@@ -309,7 +286,9 @@ class Bag:
             for _, time, data in self.reader.messages(connections):
                 yield time, data
         except Exception as error:
-            raise InputError(self.path, f"{DAMAGED} ({error}): {way_to_mend(self.path)}") from None
+            raise InputError(
+                self.path, f"expected a whole bag, found one that is damaged ({error})"
+            ) from None
 
     def _store(self, connection: Any) -> Any:
         """Types of a topic: those of the bag, else those of the options and of ROS."""
@@ -370,5 +349,5 @@ def _rosbags() -> tuple[Any, Any, Any]:
     try:
         from rosbags import rosbag1, rosbag2, typesys  # noqa: PLC0415
     except ImportError:
-        raise PathspaceError(f"bags: expected the package rosbags, found none: {INSTALL}") from None
+        raise PathspaceError(f"bags: expected the package rosbags, found none: {install('ros')}") from None
     return rosbag1, rosbag2, typesys

@@ -132,14 +132,17 @@ def yaw_rate_of(message: Any) -> float:
     return float(message.angular_velocity.z)
 
 
-def yaw_of(quaternion: Any) -> float:
-    """Yaw of a quaternion with x, y, z and w (rad)."""
+def yaw_of(quaternion: Any) -> Any:
+    """Yaw of a quaternion with x, y, z and w (rad), or of arrays of them."""
     x, y, z, w = quaternion.x, quaternion.y, quaternion.z, quaternion.w
-    return float(np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z))
+    return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
-def points_of(message: Any, rule: LabelRule) -> Points:
-    """Points of a scan, a cloud, an array of markers, or lists of cones, polylines or numbers."""
+def points_of(message: Any, rule: LabelRule, namespaces: Sequence[str] = ()) -> Points:
+    """Points of a scan, a cloud, an array of markers, or lists of cones, polylines or numbers.
+
+    Markers are those of the namespaces, by default of all.
+    """
     if hasattr(message, "angle_increment"):
         return scan_points(message)
     if hasattr(message, "point_step"):
@@ -147,7 +150,7 @@ def points_of(message: Any, rule: LabelRule) -> Points:
     if hasattr(message, "x") and hasattr(message, "y"):
         return array_points(message, rule)
     if hasattr(message, "markers"):
-        return marker_points(message, rule)
+        return marker_points(message, rule, namespaces)
     return cone_points(message, rule)
 
 
@@ -214,14 +217,15 @@ def array_points(message: Any, rule: LabelRule) -> Points:
     return Points.of(np.column_stack([x, y]), labels)
 
 
-def marker_points(array: Any, rule: LabelRule) -> Points:
+def marker_points(array: Any, rule: LabelRule, namespaces: Sequence[str] = ()) -> Points:
     """Points of a `MarkerArray` that are added: blue ones are left, yellow ones right.
 
-    A strip of lines is a polyline.
+    A strip of lines is a polyline. Markers are those of the namespaces, by default of all.
     """
     rows = [
         (*row, number if marker.type == LINE_STRIP else ALONE)
         for number, marker in enumerate(_added(array.markers))
+        if not namespaces or marker.ns in namespaces
         for row in _of_marker(marker, rule)
     ]
     return Points.of([row[:2] for row in rows], [row[2] for row in rows], lines=[row[3] for row in rows])
@@ -230,6 +234,11 @@ def marker_points(array: Any, rule: LabelRule) -> Points:
 def _added(markers: Iterable[Any]) -> Iterator[Any]:
     known = (*POINT_MARKERS, *LIST_MARKERS, LINE_STRIP)
     return (marker for marker in markers if marker.action == ADDED and marker.type in known)
+
+
+def namespaces_of(message: Any) -> list[str]:
+    """Namespace of each marker of a message that is added; none of other messages."""
+    return [marker.ns for marker in _added(getattr(message, "markers", ()))]
 
 
 def _of_marker(marker: Any, rule: LabelRule) -> Iterator[tuple[float, float, int]]:

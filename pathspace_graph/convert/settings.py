@@ -50,8 +50,13 @@ class BagOptions:
     definition: tuple[str, ...] = ()
     """Files of messages that the bag does not define itself, as PACKAGE/msg/NAME=FILE or as a path that ends
     in PACKAGE/msg/NAME.msg."""
+    namespaces: tuple[str, ...] = ()
+    """Namespaces of the markers that are detections, by default all of them."""
     from_poses: bool = False
     """Make the twists from the poses of the odometry, for a publisher that leaves its twist zero."""
+    held: bool = False
+    """Each twist is the mean until the next one. Without it twists are samples, and those slower than 8 Hz
+    are interpolated."""
     received: bool = False
     """Use the times of receipt as stamps, even where messages have their own."""
 
@@ -195,8 +200,13 @@ class LabelRule:
         """Hint at values that may mean a side; empty where there are none."""
         unknown = [text for (text, label), _ in self.met.most_common() if label == UNKNOWN]
         unmapped = [text for text in unknown if label_words(text).isdisjoint(UNKNOWN_WORDS) and text]
+        if not unmapped:
+            return ""
+        known = {label for _, label in self.met}
+        meant = "orange" if {LEFT, RIGHT} <= known else "right" if LEFT in known else "left"
         told = f"labels {', '.join(unmapped[:MOST_SHOWN])} are read as unknown"
-        return f"{told}: --labels left={unmapped[0]} gives them a meaning" if unmapped else ""
+        others = f"left, right, orange and big_orange are known labels, as in --labels {meant}={unmapped[0]}"
+        return f"{told}: {others}"
 
 
 def _whole(text: str) -> str:

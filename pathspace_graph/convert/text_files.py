@@ -1,7 +1,6 @@
 """Text files: CSV with columns of any names and units, and JSON lines."""
 
 import json
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -25,22 +24,29 @@ from pathspace_graph.io.parsing import (
     read_text,
     shown,
 )
+from pathspace_graph.io.results import read_trajectory
 from pathspace_graph.labels import UNKNOWN
 
-from .messages import ALONE, BROKEN, Points, cone_points, scan_points
+from .messages import ALONE, BROKEN, Points, cone_points, scan_points, yaw_of
 from .recording import Recording
 from .settings import LabelRule
 
 ODOMETRY: Final = "odometry"
 DETECTIONS: Final = "detections"
 QUANTITIES: Final = {  # columns of each file and their quantities; a covariance is of the square of one
-    ODOMETRY: {"t": "time", "vx": "speed", "vy": "speed", "wz": "yaw_rate"},
+    ODOMETRY: {
+        **{"t": "time", "vx": "speed", "vy": "speed", "wz": "yaw_rate"},
+        **{"x": "length", "y": "length", "yaw": "angle", "qx": "", "qy": "", "qz": "", "qw": ""},
+    },
     DETECTIONS: {
         **{"t": "time", "x": "length", "y": "length", "range": "length", "bearing": "angle", "label": ""},
         **{"xx": "length", "xy": "length", "yy": "length", "line": ""},
     },
 }
 COVARIANCE: Final = ("xx", "xy", "yy")  # columns of the covariance of a detection, if there is one
+QUATERNION: Final = ("qx", "qy", "qz", "qw")  # columns of a rotation, in place of a yaw
+OTHER_NAMES: Final = {"x": "tx", "y": "ty", "yaw": "theta"}  # columns of a pose, by the usual ones
+TUM_COLUMNS: Final = 8  # number of columns of a trajectory in the format of TUM, which has no header
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {  # units of each quantity, in SI units
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3},
@@ -50,33 +56,84 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {  # units of each quantity, i
 }
 MAX_BEARING: Final = 2.0 * pi  # largest bearing (rad); more are degrees
 LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are large
-_BEFORE_ZONE: Final = re.compile(r"\s+(?=(?:Z|[+-]\d\d(?::?\d\d)?)$)")  # blanks before Z or an offset
 MANY_ROWS: Final = 20  # number of rows from which nanoseconds are checked
 LEAST_NANOSECONDS: Final = 1e6  # that fractions of so many rows reach
-MIN_PERIOD: Final = 1e-5  # least mean period of samples (s); less is a wrong unit of time
-MAX_PERIOD: Final = 1e3  # largest mean period of samples (s); more is a wrong unit of time
+MIN_PERIOD: Final = 1e-5  # least median period of samples (s); less is a wrong unit of time
+MAX_PERIOD: Final = 1e3  # largest median period of samples (s); more is a wrong unit of time
 
 
 def read_csv(
-    odometry: Path, detections: Path, rule: LabelRule, columns: Sequence[str] = (), units: Sequence[str] = ()
+    odometry: Path,
+    detections: Path,
+    rule: LabelRule,
+    columns: Sequence[str] = (),
+    units: Sequence[str] = (),
+    *,
+    from_poses: bool = False,
+    held: bool = False,
 ) -> Recording:
     """Read the drive in two CSV files; an InputError names file, row and column.
 
     Quantities are in columns of their own names, unless `columns` says `vx=speed`, `y=-cone_y` or
     `odometry.t=stamp`, and in SI units, unless `units` says `length=mm angle=deg time=ns`. Stamps may be ISO
-    8601 dates, or seconds and nanoseconds in two columns (`t=sec+nsec`).
+    8601 dates, or seconds and nanoseconds in two columns (`t=sec+nsec`). The odometry has twists, or where
+    they are missing or `from_poses` is stated poses, which may be a trajectory in the format of TUM.
     """
     named, used = _named(columns), _units(units)
-    twists, found = (
-        _File(kind, read_table(file, (), delimiters=DELIMITERS), named, used)
-        for kind, file in ((ODOMETRY, odometry), (DETECTIONS, detections))
-    )
-    t = twists.stamps()
-    vx, wz = twists.numbers("vx"), twists.numbers("wz")
-    vy = twists.numbers("vy") if twists.has("vy") else np.zeros(len(t))
+    if _is_tum(odometry):
+        (t, motion), are_poses = read_trajectory(odometry), True
+        lines = enumerate(read_text(odometry).split("\n"), start=1)
+        rows = np.array([row for row, line in lines if line.strip() and not line.startswith("#")])
+    else:
+        file = _File(ODOMETRY, read_table(odometry, (), delimiters=DELIMITERS), named, used)
+        motion, are_poses = _motion(file, from_poses=from_poses)
+        t, rows = file.stamps(), file.table.lines
+    scans = _scans(_File(DETECTIONS, read_table(detections, (), delimiters=DELIMITERS), named, used), rule)
     in_words = ", ".join(f"{quantity} in {unit}" for quantity, unit in sorted(used.items()))
-    source = {"odometry": odometry.name, "detections": detections.name, "units": in_words}
-    return Recording(t, np.column_stack([vx, vy, wz]), *_scans(found, rule), source)
+    return Recording(
+        t,
+        motion,
+        *scans,
+        {"odometry": odometry.name, "detections": detections.name, "units": in_words},
+        are_poses=are_poses,
+        is_held=held,
+        rows=rows,
+        place=f"{odometry.name}, row",
+        units="--units speed=km/h yaw_rate=deg/s",
+    )
+
+
+def _is_tum(file: Path) -> bool:
+    """Whether a file is a trajectory in the format of TUM: eight numbers in a row, between blanks."""
+    lines = (line for line in read_text(file).split("\n") if line.strip() and not line.startswith("#"))
+    words = next(lines, "").split()
+    return len(words) == TUM_COLUMNS and all(map(is_number, words))
+
+
+def _motion(file: "_File", *, from_poses: bool) -> tuple[Array, bool]:
+    """Twists (rows, 3) or poses (rows, 3) of the odometry, with NaN where they are missing; and which."""
+    x, y, yaw = (file.find(key) for key in ("x", "y", "yaw"))
+    turned = [file.find(key) for key in QUATERNION]
+    has_poses = bool(x and y and (yaw or all(turned)))
+    if from_poses and not has_poses:
+        expected = (
+            "--from-poses: expected the columns x, y and yaw, or qx, qy, qz and qw (--columns yaw=NAME)"
+        )
+        raise InputError(file.table.file, f"{expected}, found {', '.join(file.table.columns)}", 1)
+    if has_poses and (from_poses or not (file.has("vx") and file.has("wz"))):
+        if not yaw:
+            turn = (file.numbers(key, name=name) for key, name in zip(QUATERNION, turned, strict=True))
+            heading = np.asarray(yaw_of(SimpleNamespace(**dict(zip("xyzw", turn, strict=True)))))
+        else:
+            heading = file.numbers("yaw", name=yaw)
+        return np.column_stack([file.numbers("x", name=x), file.numbers("y", name=y), heading]), True
+    vx, wz = file.numbers("vx"), file.numbers("wz")
+    vy = file.numbers("vy") if file.has("vy") else np.zeros(len(vx))
+    twists = np.column_stack([vx, vy, wz])
+    if has_poses and not np.nan_to_num(twists).any() and np.ptp(file.numbers("x", name=x)) > 0.0:
+        found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
+        raise InputError(file.table.file, f"expected twists, {found}")
+    return twists, False
 
 
 def _named(pairs: Sequence[str]) -> dict[tuple[str, str], str]:
@@ -116,6 +173,9 @@ class _File:
     units: dict[str, str]
 
     def __post_init__(self) -> None:
+        if any(map(is_number, self.table.columns)):
+            found = f"found the numbers {', '.join(self.table.columns)}"
+            raise InputError(self.table.file, f"expected a header with the names of the columns, {found}", 1)
         if not len(self.table):
             raise InputError(self.table.file, "expected at least one row, found a header only", 2)
 
@@ -123,22 +183,28 @@ class _File:
         """Whether the file has the column of a quantity; one that was named must be there."""
         return (self.kind, key) in self.named or key in self.table.columns
 
+    def find(self, key: str) -> str:
+        """Column of a part of a pose, where there is one: as it was named, or by a usual name."""
+        stated = self.named.get((self.kind, key), "").removeprefix("-")
+        return next((name for name in (stated, key, OTHER_NAMES.get(key)) if name in self.table.columns), "")
+
     def column(self, key: str, column: str = "") -> str:
         """Column of a quantity, which must be there; it may be one of several `column`s."""
         column = column or self.named.get((self.kind, key), key).removeprefix("-")
         if column not in self.table.columns:
             otherwise = f", or {key}=SECONDS+NANOSECONDS" * (key == "t")
-            expected = f"expected a column '{column}' for {key} (--columns {key}=NAME{otherwise})"
+            pose = ", or a pose x, y, yaw" * (key in ("vx", "wz"))
+            expected = f"expected a column '{column}' for {key}{pose} (--columns {key}=NAME{otherwise})"
             found = f"found the columns {', '.join(self.table.columns)}"
             raise InputError(self.table.file, f"{expected}, {found}", 1)
         return column
 
-    def numbers(self, key: str, power: int = 1) -> Array:
+    def numbers(self, key: str, power: int = 1, name: str = "") -> Array:
         """A column (rows,) in the SI unit or, for `power` 2, its square; NaN where it is missing."""
         quantity = QUANTITIES[self.kind][key]
         sign = -1.0 if self.named.get((self.kind, key), "").startswith("-") else 1.0
-        factor = sign * UNITS[quantity][self.units[quantity]] ** power
-        return np.asarray(factor * self.table.numbers(self.column(key), LARGEST, missing=True))
+        factor = sign * (UNITS[quantity][self.units[quantity]] ** power if quantity else 1.0)
+        return np.asarray(factor * self.table.numbers(name or self.column(key), LARGEST, missing=True))
 
     def stamps(self) -> Array:
         """Stamps (rows,) in s: numbers, dates, or seconds and nanoseconds in two columns."""
@@ -179,21 +245,16 @@ class _File:
             f"{unit} (--units time=ns)?",
         )
         stamps, expected = np.unique(t), f"expected stamps in {unit} in column '{name}'"
-        period = float(np.ptp(stamps)) / max(len(stamps) - 1, 1)
+        period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
         if len(stamps) > 1 and not MIN_PERIOD < period < MAX_PERIOD:
             found = f"found them {period:.3g} s apart: is their unit another one?"
-            raise InputError(self.table.file, f"{expected}, {found}")
-        if np.ptp(stamps) <= 1.0 and (np.diff(t) < -0.5).sum() >= 2:
-            found = (
-                "found only the fraction of each second: --columns t=SECONDS+NANOSECONDS reads two columns"
-            )
             raise InputError(self.table.file, f"{expected}, {found}")
         return t
 
 
 def seconds_of_date(text: str) -> float | None:
     """Time (s) since 1970 of a date with a time by ISO 8601, UTC without an offset; else None."""
-    text = _BEFORE_ZONE.sub("", text.strip().upper().replace("UTC", "Z"))
+    text = text.strip()
     if is_number(text):
         return None
     try:
@@ -238,34 +299,53 @@ def _points(file: _File) -> Array:
     return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
 
 
-def read_json_lines(file: Path, rule: LabelRule) -> Recording:
+def read_json_lines(
+    file: Path, rule: LabelRule, *, from_poses: bool = False, held: bool = False
+) -> Recording:
     """Read the drive in a file of JSON lines, in SI units; an InputError names file and line.
 
     A line is `{"t": s, "twist": [vx, vy, wz]}` or `{"t": s, "detections": [{"x": m, "y": m, "label": "blue",
     "covariance": [[xx, xy], [xy, yy]]}, ...]}`, or both. Label and covariance are optional, and `range` and
-    `bearing` may replace `x` and `y`. Instead of detections a line may have
+    `bearing` may replace `x` and `y`. Where there is no twist, or `from_poses` is stated, the motion is that
+    of `"pose": [x, y, yaw]`. Instead of detections a line may have
     `"polylines": [{"points": [[x, y], ...], "label": "left"}, ...]` or a scan as of a `LaserScan`:
     `"scan": {"angle_min": rad, "angle_increment": rad, "range_min": m, "range_max": m, "ranges": [m, ...]}`.
     """
-    t, twists, scan_t, scans = [], [], [], []
+    moved: dict[str, list[tuple[int, float, Array]]] = {"twist": [], "pose": []}
+    scan_t, scans = [], []
     for row, line in enumerate(read_text(file).splitlines(), start=1):
         if not line.strip():
             continue
         try:
             entry = json.loads(line, object_hook=lambda entries: SimpleNamespace(**entries))
             stamp = float(entry.t)
-            if hasattr(entry, "twist"):
-                t.append(stamp)
-                twists.append(np.array(entry.twist, dtype=float).reshape(3))
+            for name, found in moved.items():
+                if hasattr(entry, name):
+                    found.append((row, stamp, np.array(getattr(entry, name), dtype=float).reshape(3)))
             points = [*_points_of_line(entry, rule)]
         except BROKEN as error:
             expected = "expected a line with t, and with twist [vx, vy, wz], detections, polylines or a scan"
-            found = f"found {shown(line)} ({type(error).__name__}: {error})"
-            raise InputError(file, f"{expected}, {found}", row) from None
+            told = f"found {shown(line)} ({type(error).__name__}: {error})"
+            raise InputError(file, f"{expected}, {told}", row) from None
         scan_t += [stamp] * len(points)
         scans += points
-    measured = np.array(t), np.array(twists).reshape(-1, 3)
-    return Recording(*measured, np.array(scan_t), scans, {"file": file.name})
+    are_poses = bool(from_poses or (moved["pose"] and not moved["twist"]))
+    if from_poses and not moved["pose"]:
+        raise InputError(file, "--from-poses: expected lines with pose [x, y, yaw], found none")
+    entries = moved["pose" if are_poses else "twist"]
+    rows, t = (np.array([entry[k] for entry in entries]) for k in range(2))
+    motion = np.array([entry[2] for entry in entries]).reshape(-1, 3)
+    return Recording(
+        np.asarray(t, float),
+        motion,
+        np.array(scan_t),
+        scans,
+        {"file": file.name},
+        are_poses=are_poses,
+        is_held=held,
+        rows=rows,
+        place=f"{file.name}, line",
+    )
 
 
 def _points_of_line(entry: SimpleNamespace, rule: LabelRule) -> Iterator[Points]:

@@ -120,15 +120,20 @@ class Gate(Copyable):
 
 def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
     """Read a log and check all its cycles; an unusable one raises an InputError with file, row and stamp."""
-    log, newest = read_log(folder), Newest()
-    gate = Gate(limits, scale_of(log), of_lines=kind_of(log) == "line")
+    log = read_log(folder)
+    check_usable(log, folder, limits)
+    return log
+
+
+def check_usable(log: Log, folder: Path, limits: LimitSettings) -> None:
+    """Raise an InputError of the log in a folder, with row and stamp, where a cycle is unusable."""
+    gate, newest = Gate(limits, scale_of(log), of_lines=kind_of(log) == "line"), Newest()
     for odometry, detections in split_odometry(log):
         try:
             admitted = gate.admit(odometry, detections, newest)
         except ReadingError as error:
             raise _of_file(error, folder, log, odometry) from error
         newest = Newest(detections.t, admitted.odometry.twist[-1] if len(admitted.odometry.t) else None)
-    return log
 
 
 def _of_file(error: ReadingError, folder: Path, log: Log, odometry: Odometry) -> InputError:

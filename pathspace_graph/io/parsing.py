@@ -301,13 +301,14 @@ def read_table(
     comment: str = "",
     most: int = MAX_FILE_BYTES,
     delimiters: str = ",",
+    header: Sequence[str] = (),
 ) -> Table:
     """Read a CSV file whose header holds at least the required columns; an InputError says what is wrong.
 
     Where columns are declared, only these are read, as numbers; else all are, as texts. Quotes, blanks around
     fields, empty lines, Windows line ends, a byte-order mark and a `comment` in front of the header are
-    tolerated. Of several `delimiters` it is the most frequent one in the header; where that is no comma,
-    numbers may have a decimal comma.
+    tolerated. A file without a header has its columns in the order of `header`. Of several `delimiters` it is
+    the most frequent one in the header; where that is no comma, numbers may have a decimal comma.
     """
     with _opened(file, "a file", most) as binary:
         stream = TextIOWrapper(binary, _encoding(binary.read(2)), newline="")
@@ -316,7 +317,7 @@ def read_table(
             first = next(filter(str.strip, stream), "")
             stream.seek(0)
             reader = csv.reader(stream, delimiter=max(delimiters, key=first.count), skipinitialspace=True)
-            return _read_rows(file, reader, required, comment)
+            return _read_rows(file, reader, required, comment, header)
         except csv.Error as error:
             told = f"expected comma-separated values: {error}"
             raise InputError(file, told, reader.line_num) from error
@@ -326,10 +327,14 @@ def read_table(
 
 
 def _read_rows(
-    file: Path, reader: Any, required: Mapping[str, Column] | Sequence[str], comment: str
+    file: Path,
+    reader: Any,
+    required: Mapping[str, Column] | Sequence[str],
+    comment: str,
+    header: Sequence[str],
 ) -> Table:
     rows = ((reader.line_num, row) for row in reader if "".join(row).strip())
-    line, header = next(rows, (1, []))
+    line, header = (1, header) if header else next(rows, (1, []))
     if not header:
         raise InputError(file, f"expected a header {','.join(required)}, found an empty file", line)
     header = [name.strip() for name in header]

@@ -124,14 +124,15 @@ def _padded(cycles: Sequence[Detections]) -> tuple[Array, Array]:
 
 
 def spacing_of(cycles: Sequence[Detections]) -> float | None:
-    """Return the median distance from a detection to the nearest one of its cycle, or None without any."""
+    """Return the median distance from a detection to the nearest one elsewhere in its cycle, if any."""
     found = []
     for cycle in cycles:
         off = cycle.points_vehicle[:, None] - cycle.points_vehicle  # which may be infinite
         square = (off * off).sum(axis=-1)
-        np.fill_diagonal(square, np.inf)
+        square[square == 0.0] = np.inf  # itself, or a repetition
         found.append(np.sqrt(square.min(axis=1)))
-    return float(np.median(np.concatenate(found))) if found else None
+    spacing = float(np.median(np.concatenate(found))) if found else np.inf
+    return spacing if spacing < np.inf else None
 
 
 def motions(odometry_t: Array, poses: Array, begin: Array, end: Array) -> Array:

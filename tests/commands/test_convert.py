@@ -66,3 +66,60 @@ def test_a_part_of_a_drive_is_cut_out(recorded: Path, tmp_path: Path) -> None:
     log, begin = read_log(tmp_path / "log"), camera_drive().odometry.t[0]
     assert log.odometry.t[0] >= begin + 2.0 and log.odometry.t[-1] <= begin + 8.0
     assert all(begin + 2.0 <= cycle.t <= begin + 8.0 for cycle in log.cycles)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "expected"),
+    [
+        ("csv", ["--imu", "/imu"], "--imu: expected --from bag, found csv"),
+        ("csv", ["--received"], "--received: expected --from bag, found csv"),
+        ("csv", ["--label-field", "class"], "--label-field: expected --from bag, found csv"),
+        ("jsonl", ["--units", "length=mm"], "--units: expected --from csv, found jsonl"),
+        ("jsonl", ["--odometry", "/odom"], "--odometry: expected --from bag or csv, found jsonl"),
+        ("bag", ["--columns", "vx=speed"], "--columns: expected --from csv, found bag"),
+        ("bag", ["--units", "angle=deg"], "--units: expected --from csv, found bag"),
+    ],
+)
+def test_an_option_that_a_kind_of_record_would_ignore_is_refused(
+    kind: str,
+    options: list[str],
+    expected: str,
+    recorded: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run("convert", recorded, "--from", kind, *options, "--out", tmp_path / "log", code=2)
+    assert expected in capsys.readouterr().err
+    assert not (tmp_path / "log").exists()
+
+
+def test_hints_at_units_name_the_option(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "recorded"
+    folder.mkdir()
+    (folder / "detections.csv").write_text((recorded / "detections.csv").read_text())
+    header, *rows = (recorded / "odometry.csv").read_text().splitlines()
+    table = np.array([[float(value) for value in row.split(",")] for row in rows])
+    table[:, 1:3] *= 3.6
+    text = "\n".join([header, *(",".join(f"{value:.9g}" for value in row) for row in table), ""])
+    (folder / "odometry.csv").write_text(text)
+    run("convert", folder, *OPTIONS, "--out", tmp_path / "log")
+    assert "(--units speed=km/h)" in capsys.readouterr().err
+
+
+def test_times_of_a_run_count_from_its_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], recorded: Path
+) -> None:
+    """Stamps of a bag count from 1970; what is printed does not."""
+    folder = tmp_path / "recorded"
+    folder.mkdir()
+    for name in ("odometry.csv", "detections.csv"):
+        header, *rows = (recorded / name).read_text().splitlines()
+        moved = (f"{float(row.partition(',')[0]) + 1.7e9:.9f},{row.partition(',')[2]}" for row in rows)
+        (folder / name).write_text("\n".join([header, *moved, ""]))
+    run("convert", folder, *OPTIONS, "--out", tmp_path / "log")
+    run("online", tmp_path / "log", "--out", tmp_path / "map")
+    printed = capsys.readouterr().out
+    assert "at " in printed and "17000000" not in printed
+    assert read_log(tmp_path / "log").odometry.t[0] >= 1.7e9

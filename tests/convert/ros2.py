@@ -1,6 +1,6 @@
 """The interface of rclpy and of its messages, recorded, for where ROS isn't installed.
 
-Signatures are those of rclpy in ROS 2 Jazzy, as far as the example of a node needs them. Messages have the
+Signatures are those of rclpy in ROS 2 Jazzy, as far as the node needs them. Messages have the
 fields of their definitions in `rosbags`; as in ROS, there are no others, and each has its type.
 """
 
@@ -73,6 +73,7 @@ class Node:
     def __init__(self, name: str, now: int, parameters: dict[str, Any]) -> None:
         self.name, self._now, self._parameters = name, now, parameters
         self.published: defaultdict[str, list[Any]] = defaultdict(list)
+        self.told: list[str] = []
         self.subscribed: dict[str, tuple[type, Callable[[Any], None], QoSProfile]] = {}
 
     def declare_parameter(self, name: str, value: Any = None) -> Any:
@@ -95,7 +96,7 @@ class Node:
         return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=self._now, to_msg=lambda: stamp))
 
     def get_logger(self) -> Any:
-        return SimpleNamespace(info=lambda message: None)
+        return SimpleNamespace(info=self.told.append, error=self.told.append)
 
 
 def install(patch: pytest.MonkeyPatch, spin: Callable[[Node], None], now: int, **parameters: Any) -> None:
@@ -110,10 +111,12 @@ def install(patch: pytest.MonkeyPatch, spin: Callable[[Node], None], now: int, *
     for name, members in {
         "rclpy.executors": (ExternalShutdownException,),
         "rclpy.qos": (QoSProfile, ReliabilityPolicy),
-        "geometry_msgs.msg": ("Point", "PoseStamped"),
+        "builtin_interfaces.msg": ("Time",),
+        "geometry_msgs.msg": ("Point", "PoseStamped", "TransformStamped"),
         "nav_msgs.msg": ("Odometry", "Path"),
         "sensor_msgs.msg": ("PointCloud2",),
         "std_msgs.msg": ("Header", "String"),
+        "tf2_msgs.msg": ("TFMessage",),
         "visualization_msgs.msg": ("Marker", "MarkerArray"),
     }.items():
         package = name.partition(".")[0]

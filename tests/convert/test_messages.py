@@ -208,8 +208,17 @@ def test_the_values_of_labels_are_counted_with_what_they_were_taken_for() -> Non
     assert rule.of_all(np.array([3, 3, 4])).tolist() == [LEFT, LEFT, UNKNOWN]
     assert rule.of(SimpleNamespace(data="Yellow-cone")) == RIGHT
     assert rule.summary() == "labels: 3 is left (2), 4 is unknown (1), Yellow-cone is right (1)"
-    assert "--labels left=4" in rule.hint()
+    assert "--labels orange=4" in rule.hint()  # both sides are known, so that it may be of orange cones
     assert LabelRule().hint() == ""
+
+
+@pytest.mark.parametrize(
+    ("met", "advised"), [([], "left=4"), ([0], "right=4"), ([1], "left=4"), ([0, 1], "orange=4")]
+)
+def test_a_label_without_a_meaning_gets_one_that_is_missing(met: list[int], advised: str) -> None:
+    rule = LabelRule()
+    rule.of_all(np.array([*met, 4]))
+    assert f"--labels {advised}" in rule.hint()
 
 
 @pytest.mark.parametrize(

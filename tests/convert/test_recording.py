@@ -14,10 +14,10 @@ from pathspace_graph.convert.recording import (
     Recording,
     positive_definite,
     to_log,
-    twists_between,
     windowed,
 )
 from pathspace_graph.convert.settings import Frames, NoiseSettings, Window
+from pathspace_graph.convert.twists import twists_between
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.se2 import compose, se2_exp
 from pathspace_graph.io.covariances import ray_covariances
@@ -111,7 +111,8 @@ def test_twists_lead_from_pose_to_pose() -> None:
 def driven_at(t: np.ndarray, scan_t: np.ndarray) -> Recording:
     """A record with these stamps (s), whose k-th message has a speed of k and a cone at k + 2."""
     speeds = np.outer(np.arange(len(t)), [1.0, 0.0, 0.0])
-    return Recording(t, speeds, scan_t, [one(k + 2.0, 1.0) for k in range(len(scan_t))], {})
+    scans = [one(k + 2.0, 1.0) for k in range(len(scan_t))]
+    return Recording(t, speeds, scan_t, scans, {}, is_held=True)
 
 
 ONCE = np.arange(0.0, 24.01, 0.5)
@@ -155,7 +156,7 @@ def test_the_way_out_takes_what_is_before_or_after_the_fall() -> None:
     for part, begin in ((first, 0), (second, len(ONCE))):
         np.testing.assert_array_equal(part.t, ONCE)
         np.testing.assert_array_equal(part.scan_t, SEEN)
-        assert part.twists[0, 0] == begin
+        assert part.motion[0, 0] == begin
     with pytest.raises(InputError, match="at message 50"):
         windowed(source, Window(start=3.0), FILE)
 
@@ -170,7 +171,7 @@ def test_a_drive_before_a_clock_was_set_later_is_cut_off_by_its_stamps() -> None
     [
         (ONCE[[*range(10), 13, 12, 11, 10, *range(14, 49)]], 3),  # by 1.5 s at the most
         (ONCE[::-1], 48),  # the newest first
-        (np.insert(ONCE, 20, 500.0), 1),  # one stray stamp
+        (np.insert(ONCE, 20, 30.0), 1),
         (np.insert(ONCE, 20, 0.1), 1),
     ],
 )

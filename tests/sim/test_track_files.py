@@ -274,6 +274,42 @@ def test_unknown_kind_names_the_known_ones(tmp_path: Path, name: str, text: str)
         read_track(tmp_path / name)
 
 
+@pytest.mark.parametrize("columns", [3, 4, 7])
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+@pytest.mark.parametrize("seed", range(5))
+def test_cones_without_a_header_are_those_with_one(
+    tmp_path: Path, seed: int, ends: str, columns: int
+) -> None:
+    """As FSDS writes its tracks, whatever cone is in the first row."""
+    rng = np.random.default_rng(seed)
+    lines = eufs_text(generate_track(rng), rng).splitlines()
+    rows = [",".join(f"{line},0.01,0.01,0".split(",")[:columns]) for line in lines[1:]]
+    names = ",".join(["tag", "x", "y", "direction", "x_variance", "y_variance", "xy_covariance"][:columns])
+    with_header, without = tmp_path / "with.csv", tmp_path / "without.csv"
+    with_header.write_bytes(ends.join([names, *rows, ""]).encode())
+    without.write_bytes(ends.join([*rows, ""]).encode())
+    expected, found = read_track(with_header), read_track(without)
+    for name in ("left", "right", "other", "start"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("row", ["1.0,2.0,3.0,4.0", "cone,1.0,2.0", "blue,1.0", "blue,x,y", "blue;1.0;2.0"])
+def test_rows_that_are_no_cones_are_shown_with_the_headers_that_are_known(tmp_path: Path, row: str) -> None:
+    file = tmp_path / "track.csv"
+    file.write_text(f"{row}\n{row}\n")
+    with pytest.raises(InputError) as error:
+        read_track(file)
+    assert error.value.row == 1
+    assert "(tag,x,y,direction)" in str(error.value) and f"found '{row}'" in str(error.value)
+
+
+def test_a_wrong_row_of_a_file_without_a_header_has_its_number(tmp_path: Path) -> None:
+    file = tmp_path / "track.csv"
+    file.write_text("blue,1,2,0\nblue,1,x,0\n")
+    with pytest.raises(InputError, match="row 2: expected a number in column 'y', found 'x'"):
+        read_track(file)
+
+
 def test_missing_file(tmp_path: Path) -> None:
     for name in ("t.csv", "t.yaml", "t.txt"):
         with pytest.raises(InputError, match="found none"):

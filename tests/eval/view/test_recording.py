@@ -38,7 +38,8 @@ def test_without_the_package_one_line_says_how_to_install_it(
     monkeypatch.setitem(sys.modules, "rerun", None)
     given = [option] if option == "--view" else [option, str(log_folder.parent / "a.rrd")]
     assert refused(capsys, log_folder, *given) == (
-        f"pathspace-graph: {option}: expected the package rerun-sdk, found none; pip install -e '.[view]'"
+        f"pathspace-graph: {option}: expected the package rerun-sdk, found none; "
+        "pip install 'pathspace-graph[view]'"
     )
 
 

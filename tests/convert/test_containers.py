@@ -1,0 +1,137 @@
+"""Files that are no ROS bags are named for what they are, and nothing is written."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import lzma
+import sqlite3
+import struct
+import zipfile
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from pathspace_graph.cli import main
+from pathspace_graph.convert.containers import described
+
+CASES = Path(__file__).parents[3] / "shared" / "cases"
+MAGIC = b"\x89MCAP0\r\n"
+
+
+def text(value: str) -> bytes:
+    return struct.pack("<I", len(value)) + value.encode()
+
+
+def record(kind: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", kind, len(content)) + content
+
+
+def mcap(profile: str, encodings: dict[str, str], *, summary: bool = True) -> bytes:
+    """An MCAP file with a message in each topic of an encoding, by the facts of its specification."""
+    header, known, messages = record(1, text(profile) + text("test")), b"", b""
+    for number, (topic, encoding) in enumerate(encodings.items(), start=1):
+        schema = struct.pack("<H", number) + text(f"car.Message{number}") + text(encoding) + text("")
+        channel = struct.pack("<HH", number, number) + text(topic) + text(encoding) + text("")
+        known += record(3, schema) + record(4, channel)
+        messages += record(5, struct.pack("<HIQQ", number, 0, 7, 7) + b"\x01\x02")
+    begin = MAGIC + header + known + messages + record(15, struct.pack("<I", 0))
+    footer = record(2, struct.pack("<QQI", len(begin) if summary else 0, 0, 0))
+    return begin + (known if summary else b"") + footer + MAGIC
+
+
+def refused(path: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    out = path.parent.parent / "log"
+    assert main(["convert", str(path), "--odometry", "/a", "--detections", "/b", "--out", str(out)]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1 and not out.exists()
+    return line
+
+
+@pytest.mark.parametrize("summary", [True, False])
+@pytest.mark.parametrize("encoding", ["protobuf", "json", "flatbuffer", "ros1", "cbor"])
+def test_an_mcap_file_of_other_messages_says_what_it_holds(
+    encoding: str, summary: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "drives"
+    source.mkdir()
+    (source / "car.mcap").write_bytes(mcap("", {"/state": encoding, "/cones": encoding}, summary=summary))
+    for path in (source / "car.mcap", source):
+        said = refused(path, capsys)
+        assert f"an MCAP file of {encoding} messages (profile '')" in said
+        assert "/cones (car.Message2), /state (car.Message1)" in said
+        assert "damaged" not in said and "--from jsonl" in said
+
+
+def test_messages_of_several_encodings_are_all_named(tmp_path: Path) -> None:
+    file = tmp_path / "car.mcap"
+    file.write_bytes(mcap("ros2", {"/odom": "cdr", "/cones": "protobuf"}))
+    assert "an MCAP file of cdr and protobuf messages (profile 'ros2'), not of ROS 2" in described(file)
+    file.write_bytes(mcap("x", {f"/topic{k}": "json" for k in range(20)}))
+    assert described(file).count("/topic") == 8 and described(file).endswith(", ...")
+    file.write_bytes(mcap("x", {}))
+    assert described(file) == "an MCAP file without topics (profile 'x')"
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_one_that_was_cut_off_is_told_as_that(share: float, tmp_path: Path) -> None:
+    whole = mcap("", {"/state": "protobuf"})
+    (tmp_path / "car.mcap").write_bytes(whole[: max(int(share * len(whole)), 12)])
+    assert described(tmp_path / "car.mcap") == "an MCAP file that was cut off or is damaged"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (gzip.compress(b"#ROSBAG V2.0\n"), "gzip has compressed"),
+        (bz2.compress(b"#ROSBAG V2.0\n"), "bzip2 has compressed"),
+        (lzma.compress(b"#ROSBAG V2.0\n"), "xz has compressed"),
+        (b"\x28\xb5\x2f\xfd rest", "zstd has compressed"),
+        (b"\x89HDF\r\n\x1a\n rest", "an HDF5 file"),
+        (b"ULog\x01\x12\x35\x01 rest", "a ULog of PX4"),
+        (b"#ROSBAG V2.0\n", "a bag of ROS 1 that is damaged or was cut off"),
+        (b"t,vx,vy,wz\n0,1,0,0\n", "text that begins with 't,vx,vy,wz'"),
+        (b'{"t": 0}\n', "text in JSON"),
+        (b"", "an empty file"),
+        (bytes(range(256)), "a file of an unknown kind"),
+    ],
+)
+def test_a_file_of_another_kind_is_named(
+    content: bytes, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "drives").mkdir()
+    for name in ("drive.bag", "drive.mcap", "drive.db3", "drive"):
+        file = tmp_path / "drives" / name
+        file.write_bytes(content)
+        assert f"expected a ROS bag, found {said}" in refused(file, capsys).replace("a file that ", "")
+        file.unlink()
+
+
+def test_archives_databases_and_folders_are_named(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "drive.zip", "w") as archive:
+        archive.writestr("drive.bag", "x")
+    assert described(tmp_path / "drive.zip") == "a ZIP archive"
+    with closing(sqlite3.connect(tmp_path / "drive.db3")) as database:
+        database.execute("CREATE TABLE poses (t REAL)")
+        database.commit()
+    assert described(tmp_path / "drive.db3").endswith("with the tables poses")
+    for name, said in (
+        ("log.toml", "a log"),
+        ("odometry.csv", "a folder of CSV files"),
+        ("a.bin", "a.bin, "),
+    ):
+        folder = tmp_path / name.partition(".")[0]
+        folder.mkdir()
+        (folder / name).write_text("x")
+        assert said in described(folder)
+    (tmp_path / "empty").mkdir()
+    assert described(tmp_path / "empty") == "an empty folder"
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="the cases of others aren't beside the repository")
+def test_the_case_of_others_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "log"
+    assert main(["convert", str(CASES / "protobuf_mcap" / "proto.mcap"), "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert "an MCAP file of protobuf messages (profile '')" in said and "/cones (car.VehicleState)" in said
