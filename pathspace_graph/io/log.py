@@ -219,6 +219,7 @@ class Log:
         labels: Iterable[int | str] | None = None,
         covariances: ArrayLike | None = None,
         odometry_sigma: ArrayLike | None = None,
+        odometry_drift: ArrayLike | None = None,
         kind: Kind | None = None,
     ) -> Log:
         """Make the log of body twists (N, 3) at t (N,) and of points (m, 2) detected at detection_t (m,).
@@ -226,7 +227,7 @@ class Log:
         Units are s, m and rad, points are in the vehicle frame, and each twist is held until the next.
         Detections of one stamp are one cycle. A label is a number or a word, by default unknown.
         Noise that is not given, covariances (m, 2, 2) or sigmas (3,) of a twist, is measured when the log is
-        mapped. An InputError names the argument and the row, from 1.
+        mapped; a drift (3,) that is not given beside sigmas is assumed. An InputError names the argument and the row, from 1.
         """
         points, (m, s) = np.asarray(points, float).reshape(-1, 2), (covariances, odometry_sigma)
         K = np.asarray(ray_covariances(points, SIGMA_DETECTIONS) if m is None else m, float).reshape(-1, 4)
@@ -241,6 +242,7 @@ class Log:
             SensorInfo(kind=kind),
             odometry_stated=s is not None,
             detections_stated=m is not None,
+            odometry_drift=None if odometry_drift is None else np.array(odometry_drift, float),
         )
 
     @property

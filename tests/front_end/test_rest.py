@@ -104,6 +104,18 @@ def test_means_are_weighted_by_information() -> None:
     assert mean_bias([]) is None
 
 
+def test_the_motion_in_which_a_rest_ends_may_have_missed_the_start(log: Log) -> None:
+    check = MotionCheck(TwistNoise(log.odometry_sigma), MotionSettings())
+    motions = [check.update(odometry, cycle) for odometry, cycle in split_odometry(log)]
+    sigmas = np.array([np.sqrt(np.diag(motion.odometry.covariance)) for motion in motions])
+    starts = np.flatnonzero(sigmas[:, 0] > 0.2)
+    assert len(starts) == 1, "one rest ends"
+    assert log.cycles[int(starts[0])].t == pytest.approx(REST, abs=0.5)
+    np.testing.assert_allclose(sigmas[starts[0]], np.hypot([0.3, 0.05, 0.0], sigmas[starts[0] + 1]), rtol=0.1)
+    again = motions[int(starts[0])].with_noise(TwistNoise(2.0 * log.odometry_sigma))
+    assert again.odometry.covariance[0, 0] > 0.3**2, "measured noise does not forget it"
+
+
 def test_a_vehicle_that_creeps_is_not_at_rest() -> None:
     rest, rng = Rest(), np.random.default_rng(0)
     told = []

@@ -44,9 +44,10 @@ def small_log() -> Log:
         rng.normal(size=6),
     )
     source = {"track": 'a "quoted" \\ name\n', "Umlaut": "Zürich \x7f"}
-    sensor = SensorInfo(range_max=15.0, fov=1.9, kind="line")
+    sensor = SensorInfo(range_max=15.0, fov=1.9, kind="line", sigma_range_scale=0.001)
+    odometry, sigma = Odometry(t, rng.normal(size=(11, 3))), np.array([0.1, 0.2, 1e-5])
     return Log(
-        Odometry(t, rng.normal(size=(11, 3))), cycles, np.array([0.1, 0.2, 1e-5]), sensor, source, truth=truth
+        odometry, cycles, sigma, sensor, source, odometry_drift=np.array([0.1, 0.0, 1e-3]), truth=truth
     )
 
 
@@ -54,6 +55,9 @@ def assert_same(a: Log, b: Log) -> None:
     np.testing.assert_array_equal(a.odometry.t, b.odometry.t)
     np.testing.assert_array_equal(a.odometry.twist, b.odometry.twist)
     np.testing.assert_array_equal(a.odometry_sigma, b.odometry_sigma)
+    assert (a.odometry_drift is None) == (b.odometry_drift is None)
+    if a.odometry_drift is not None and b.odometry_drift is not None:
+        np.testing.assert_array_equal(a.odometry_drift, b.odometry_drift)
     assert a.sensor == b.sensor
     assert dict(a.source) == dict(b.source)
     assert len(a.cycles) == len(b.cycles)
@@ -73,6 +77,9 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
     log = small_log()
     write_log(log, tmp_path / "log")
     assert_same(read_log(tmp_path / "log"), log)
+    log = replace(log, odometry_drift=None, sensor=SensorInfo())
+    write_log(log, tmp_path / "less")
+    assert_same(read_log(tmp_path / "less"), log)
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -308,6 +315,7 @@ def test_a_log_of_arrays_is_the_one_that_is_read_from_files() -> None:
     covariances = np.concatenate([cycle.covariances for cycle in cycles])
     labels = ["left", "yellow", UNKNOWN] * 3
     noise = {"covariances": covariances, "odometry_sigma": log.odometry_sigma}
+    noise["odometry_drift"] = log.odometry_drift
     made = Log.from_arrays(
         log.odometry.t, log.odometry.twist, stamps, points, labels=labels, kind="line", **noise
     )

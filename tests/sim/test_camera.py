@@ -142,7 +142,10 @@ def test_the_command_takes_presets_and_single_options_beside_them(tmp_path: Path
     assert log.truth is not None and log.truth.sensor is not None and log.truth.noise is not None
     np.testing.assert_array_equal(log.truth.sensor, [-0.0175, 0.0, -0.12, 0.08, -0.19])
     np.testing.assert_array_equal(log.truth.noise[3:], [0.08, 0.8, 8.0])
-    np.testing.assert_array_equal(log.odometry_sigma, np.hypot(INS.white, INS.slow))
+    np.testing.assert_array_equal(log.odometry_sigma, INS.white)
+    assert log.odometry_drift is not None  # of errors that last 5 s: a random walk of sigma sqrt(2 * 5 s)
+    np.testing.assert_allclose(log.odometry_drift, np.sqrt(10.0) * np.array(INS.slow), rtol=1e-5)
+    assert log.sensor.sigma_range_scale is None, "nobody knows the scale of a camera"
     other = command(tmp_path / "other", "--faults.sensor.yaw", "0.1", "--odometry=plain", "--sensor=camera")
     assert other.truth is not None and other.truth.sensor is not None
     np.testing.assert_array_equal(other.truth.sensor, [0.1, 0.0, -0.12, 0.08, -0.19])

@@ -229,6 +229,22 @@ def test_zeros_and_gaps_take_1_s_of_the_odometry_and_leave_the_rest(clean: Log) 
     np.testing.assert_array_equal(gap.twist, odometry.twist[kept])
 
 
+def test_a_start_below_the_dead_band_is_missed_and_nothing_else() -> None:
+    """From rest with 3 m/s^2 to 1.5 m/s: half a second, in which the vehicle moves by 0.375 m."""
+    vehicle = VehicleSettings(rest=1.0, stand=1.0)
+    quiet = OdometryNoise(white=(1e-9, 1e-9, 1e-9), scale=0.0, gyro_bias=0.0)
+    settings = SimulationSettings(laps=1, vehicle=vehicle, odometry=quiet)
+    whole = simulate(bean_track(), settings, seed=0)
+    dead = replace(settings, faults=Faults(odometry=OdometryFaults(dead_band=1.5)))
+    missed = simulate(bean_track(), dead, seed=0)
+    differs = np.abs(whole.odometry.twist - missed.odometry.twist).max(axis=1) > 1e-6
+    assert whole.odometry.t[differs].min() == pytest.approx(1.0, abs=0.05)
+    assert whole.odometry.t[differs].max() == pytest.approx(1.5, abs=0.05)
+    assert np.abs(missed.odometry.twist[differs]).max() < 1e-6
+    way = 0.02 * whole.odometry.twist[differs, 0].sum()
+    assert way == pytest.approx(0.375, abs=0.05)
+
+
 def test_a_log_that_begins_with_a_gap_still_has_its_first_stamp() -> None:
     odometry = drive(LAPS, odometry=OdometryFaults(gap=1.0, gap_at=0.0)).odometry
     assert odometry.t[0] == 0.0

@@ -119,3 +119,13 @@ def test_nothing_crosses_nothing() -> None:
     assert crossings_told([Crossing(RIGHT, np.array([1.0, 2.0]), 3.0)]).endswith(
         "x = 1 m, y = 2 m, after 3 m"
     )
+
+
+def test_where_the_vehicle_was_lost_its_path_crosses_nothing() -> None:
+    """Between x = 20 and 40 m the path leads through the left boundary and back."""
+    path = STRAIGHT.copy()
+    path[20:40, 1] = 6.0 * np.sin(np.pi * np.arange(20) / 19.0)
+    assert len(crossed_boundaries(road(), path)) == 2
+    known = np.ones(len(path), bool)
+    known[19:41] = False
+    assert crossed_boundaries(road(), path, known) == []
