@@ -227,8 +227,8 @@ class Log:
         Units are s, m and rad, points are in the vehicle frame, and each twist is held until the next.
         Detections of one stamp are one cycle. A label is a number or a word, by default unknown.
         Noise that is not given, covariances (m, 2, 2) or sigmas (3,) of a twist, is measured when the log is
-        mapped; a drift (3,) that is not given beside sigmas is assumed. An InputError names the argument and the
-        row, from 1.
+        mapped; a drift (3,) that is not given beside sigmas is assumed. An InputError names the argument and
+        the row, from 1.
         """
         points, (m, s) = np.asarray(points, float).reshape(-1, 2), (covariances, odometry_sigma)
         K = np.asarray(ray_covariances(points, SIGMA_DETECTIONS) if m is None else m, float).reshape(-1, 4)
