@@ -282,12 +282,10 @@ class Rest(Copyable):
         """Return the bias measured since the last result, if that is `REST_TIME` ago at t (s)."""
         if t - self._measured_since < REST_TIME:
             return None
-        mean, sigma = (
-            self._rate_sum / self._rate_count,
-            noise.of_mean(self._rate_count, t - self._measured_since),
-        )
+        sigma = float(noise.of_mean(self._rate_count, t - self._measured_since)[2])
+        measured = BiasMeasurement(self._rate_sum / self._rate_count, sigma)
         self._measured_since, self._rate_sum, self._rate_count = t, 0.0, 0
-        return BiasMeasurement(mean, float(sigma[2]))
+        return measured
 
 
 def _is_still(mean: Array, sigma: Array) -> bool:

@@ -25,8 +25,8 @@ FIRST: Final = 8.0  # driving time before the first measurement of noise (s)
 AGAIN: Final = 1.5  # growth of the driving time between measurements
 MOST_CYCLES: Final = 300  # largest number of newest cycles in a measurement, which bounds its time
 DRIVING_SPEED: Final = 0.3  # least speed of driving (m/s)
-SCALE, BIAS = SENSOR.index("range_scale"), SENSOR.index("range_bias")
-"""Indices of the errors of the ranges."""
+SCALE: Final = SENSOR.index("range_scale")  # index of the scale error of the ranges
+BIAS: Final = SENSOR.index("range_bias")  # index of their bias
 DOUBT_SCALE: Final = (0.8, 0.5)
 """Contradiction of the scale by that of another error: alone, and beside a contradicted one.
 
