@@ -53,7 +53,7 @@ ARROWS: dict[str, set[str]] = {
     "snapshot": {"factors", "io", "graph"},
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
-    "plausibility": {"factors", "settings", "spline", "io", "front_end", "scale"},
+    "plausibility": {"factors", "settings", "spline", "io", "health", "front_end", "scale"},
     **dict.fromkeys(sorted(ESTIMATORS), BELOW_ESTIMATORS),
     "loop": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
     "online": BELOW_ESTIMATORS | {"loop"},

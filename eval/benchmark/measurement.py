@@ -50,7 +50,7 @@ class ToldLandmarks:
         self._cycles: Iterator[tuple[Odometry, Detections]] = split_odometry(log)
         ends = np.cumsum([len(cycle.labels) for cycle in log.cycles])
         self._cones: Iterator[IntArray] = iter(np.split(log.truth.associations, ends[:-1]))
-        self._noise = log.noise.twist
+        self._sigma = log.odometry_sigma
         self._pose: Array = np.zeros(3)
         self._count = 0
         self._seen: set[int] = set()
@@ -77,7 +77,7 @@ class ToldLandmarks:
             known = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3, 1e-3, 1e-4]))  # the origin of the map
             graph.add(gtsam.PriorFactorPose2(key, gtsam.Pose2(), known))
             return
-        motion = integrate_odometry(odometry, t, self._noise)
+        motion = integrate_odometry(odometry, t, self._sigma)
         noise = gtsam.noiseModel.Gaussian.Covariance(motion.covariance)
         graph.add(gtsam.BetweenFactorPose2(key - 1, key, gtsam.Pose2(*motion.delta), noise))
         self._pose = compose(self._pose, motion.delta)

@@ -289,7 +289,8 @@ def solve_landmarks(
     associations = associations[~np.concatenate([is_orange(cycle) for cycle in log.cycles])]
     settings = settings or MapperSettings()
     settings = replace(settings, gate=replace(settings.gate, huber=np.inf))
-    system = LandmarkSystem.of_log(log, settings, KnownNoise(log.odometry_sigma, drift=log.odometry_drift))
+    drift = np.zeros(3) if log.odometry_drift is None else log.odometry_drift
+    system = LandmarkSystem.of_log(log, settings, KnownNoise(log.odometry_sigma, drift=drift))
     state = start_oracle(system, associations)
     system.optimize(state)
     return system, state

@@ -89,7 +89,7 @@ def check_crossings(track: Map, folder: Path) -> None:
         return
     path, cycles = read_trajectory(file)[1][:, :2], folder / CYCLES_FILE
     health = read_table(cycles, {}).columns.get("health", ()) if cycles.exists() else ()
-    lost = np.array([condition == LOST for condition in health])
+    lost = np.array([condition == LOST for condition in health], bool)
     known = ~lost if len(lost) == len(path) else None
     crossed = crossings_told(crossed_boundaries(track.splines, path, known))
     if crossed:

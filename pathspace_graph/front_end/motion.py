@@ -229,7 +229,7 @@ class HeldTwists(Copyable):
         The noise of a twist grows while it is held for long.
         """
         if len(odometry.t) == 0:
-            none = integrate_odometry(odometry, t, noise)  # no motion, with certainty
+            none = integrate_odometry(odometry, t, noise.white)  # no motion, with certainty
             return MeasuredMotion(none, odometry.twist, missing=before is not None)
         measured = odometry.t
         goes_on = self.newest is not None and (odometry.twist[0] == self.newest).all()

@@ -98,10 +98,12 @@ def _positive_sigmas(values: Any) -> Array:
     return sigmas
 
 
-def integrate_odometry(odometry: Odometry, until: float, noise: TwistNoise) -> IntegratedOdometry:
-    """Integrate twists, each constant until the next one, and the last one until a stamp (s)."""
-    durations = np.diff(np.append(odometry.t, until))
-    return integrate_twists(durations, odometry.twist, noise.sigmas(durations))
+def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:
+    """Integrate twists, each constant until the next one, and the last one until a stamp (s).
+
+    sigma, (3,) or (k, 3), is the standard deviation of one measured twist (m/s, m/s, rad/s).
+    """
+    return integrate_twists(np.diff(np.append(odometry.t, until)), odometry.twist, sigma)
 
 
 def predict(smoother: FixedLagSmoother[MapRows], path: DrivenPath, motion: MeasuredMotion, t: float) -> None:

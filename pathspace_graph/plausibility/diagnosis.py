@@ -71,8 +71,8 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any], scale: float = 1.
 def crossings_of(result: RunResult) -> list[Crossing]:
     """Return the places where the vehicle crossed the boundaries of its map, unless it was lost there."""
     path = result.trajectory if result.smoothed is None else result.smoothed
-    lost = [record.health == LOST for record in result.cycles]
-    known = ~np.array(lost) if len(lost) == len(path) else None
+    lost = np.array([record.health == LOST for record in result.cycles], bool)
+    known = ~lost if len(lost) == len(path) else None
     return crossed_boundaries(result.map.splines, path[:, :2], known)
 
 

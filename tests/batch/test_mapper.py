@@ -45,7 +45,7 @@ def bean() -> Log:
 
 @cache
 def solved(start: Start) -> BatchResult:
-    return BatchMapper(None, bean().odometry_sigma, FixedLagMapper).solve(bean(), start)
+    return BatchMapper(None, bean().noise, FixedLagMapper).solve(bean(), start)
 
 
 def broken_off(log: Log, share: float) -> Log:

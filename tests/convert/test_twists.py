@@ -69,7 +69,7 @@ def write(folder: Path, log: Log, rows: np.ndarray, header: str = "t,vx,vy,wz") 
 
 def convert(source: Path, *options: str, code: int = 0) -> Path:
     out = source.parent / "log"
-    assert main(["convert", str(source), "--from", "csv", "--out", str(out), *options]) == code
+    assert main(["convert", str(source), "--from", "csv", "--out", str(out), "--force", *options]) == code
     assert out.exists() == (code == 0)
     return out
 
@@ -193,7 +193,7 @@ def test_the_case_of_others_is_named_and_mapped(
         rows[:, 3] = np.gradient(wrapped(true_poses(drive(), rows[:, 0])[:, 2]), rows[:, 0])
     out = convert(write(tmp_path, drive(), rows))
     assert "odometry samples can't be" in capsys.readouterr().out
-    assert main(["online", str(out), "--out", str(tmp_path / "map")]) == 0
+    assert main(["online", str(out), "--out", str(tmp_path / "map"), "--force"]) == 0
 
 
 # --- poses -----------------------------------------------------------------------------------------------
@@ -285,7 +285,7 @@ def test_json_lines_may_have_poses(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(convert) == 0
     np.testing.assert_allclose(read_log(tmp_path / "log").odometry.twist, [[2.0, 0.0, 0.0]] * 2, atol=1e-9)
     file.write_text('{"t": 0, "twist": [1, 0, 0]}\n{"t": 1, "detections": [{"x": 4, "y": 1}]}\n')
-    assert main([*convert, "--from-poses"]) == 2
+    assert main([*convert, "--from-poses", "--force"]) == 2
     assert "--from-poses: expected lines with pose" in capsys.readouterr().err
 
 
@@ -367,7 +367,7 @@ def test_an_odometry_of_five_hertz_maps_the_first_lap(seed: int, tmp_path: Path)
         out = convert(source, *options)
         for name in ("truth_poses.csv", "truth_cones.csv"):
             shutil.copy(tmp_path / "whole" / name, out)
-        assert main(["online", str(out), "--out", str(tmp_path / "map")]) == 0
+        assert main(["online", str(out), "--out", str(tmp_path / "map"), "--force"]) == 0
         lap = json.loads((tmp_path / "map" / "summary.json").read_text())["laps"][0]
         assert options or lap["missed"] == 0.0
         rmse[options] = lap["rmse"]

@@ -10,6 +10,7 @@ import pytest
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_twists
 from pathspace_graph.graph.gaussian import keys_of, normal_equations
 from pathspace_graph.graph.variables import (
@@ -46,7 +47,7 @@ CHAIN = MapperSettings(
 
 def drive(log: Log, factors: Factors, settings: MapperSettings) -> tuple[FixedLagMapper, list[CycleResult]]:
     """A mapper after the log; `factors` by the cycle that they are given with."""
-    mapper = FixedLagMapper(settings, ODOMETRY_SIGMA)
+    mapper = FixedLagMapper(settings, KnownNoise(ODOMETRY_SIGMA, drift=np.zeros(3)))
     cycles = enumerate(split_odometry(log))
     return mapper, [mapper.update(o, d, factors.get(k, ())) for k, (o, d) in cycles]
 

@@ -261,7 +261,7 @@ def assert_same(found: Any, known: Any) -> None:
 
 
 def online(log: Log, scale: float | None) -> RunResult:
-    return run_online(log, FixedLagMapper(MapperSettings(scale=scale), log.odometry_sigma))
+    return run_online(log, FixedLagMapper(MapperSettings(scale=scale), log.noise))
 
 
 @cache
@@ -276,7 +276,7 @@ def test_a_log_s_times_as_large_gives_s_times_the_map(scale: float) -> None:
 
 def test_a_batch_of_a_log_s_times_as_large_is_s_times_as_large() -> None:
     log = short_drive()
-    known = BatchMapper(MapperSettings(), log.odometry_sigma, FixedLagMapper).solve(log)
+    known = BatchMapper(MapperSettings(), log.noise, FixedLagMapper).solve(log)
     larger = scaled(log, 3.0)
     found = make_batch("spline", MapperSettings(), larger).solve(larger)
     assert_alike(found, known, 3.0)
@@ -353,7 +353,7 @@ def test_a_mapper_that_is_given_no_scale_takes_scenes_as_they_are() -> None:
 def test_a_saved_mapper_keeps_its_scale(tmp_path: Path) -> None:
     log = scaled(short_drive(), 0.1)
     log = replace(log, cycles=log.cycles[:30])
-    mapper = FixedLagMapper(MapperSettings(scale=0.1), log.odometry_sigma)
+    mapper = FixedLagMapper(MapperSettings(scale=0.1), log.noise)
     cycles = [*split_odometry(log)]
     for cycle in cycles[:5]:
         mapper.update(*cycle)

@@ -62,7 +62,8 @@ def exact_log(twists: Array, cones: Array, labels: IntArray) -> Log:
     t = DT * np.arange(len(twists))
     poses = integrate(twists[:-1], DT)
     cycles = tuple(see(float(t[k]), poses[k], cones, labels) for k in range(0, len(t), CYCLE))
-    return Log(Odometry(t, twists), cycles, ODOMETRY_SIGMA, truth=Truth(t, poses, cones, labels))
+    truth = Truth(t, poses, cones, labels)
+    return Log(Odometry(t, twists), cycles, ODOMETRY_SIGMA, odometry_drift=np.zeros(3), truth=truth)
 
 
 def corridor(length: float, gap: float = 4.0, half_width: float = 2.0) -> tuple[Array, IntArray]:

@@ -80,7 +80,8 @@ def beginning_of(log: Log, cycles: int) -> tuple[Log, NDArray[np.int_]]:
     """Returns the first cycles of a simulated log, and their true associations."""
     first = beginning(log, cycles)
     assert first.truth is not None and first.truth.associations is not None
-    return Log(log.odometry, first.cycles, log.odometry_sigma), first.truth.associations
+    made = Log(log.odometry, first.cycles, log.odometry_sigma, odometry_drift=np.zeros(3))
+    return made, first.truth.associations
 
 
 def oracle_system(log: Log, cycles: int) -> tuple[LandmarkSystem, LandmarkState]:
