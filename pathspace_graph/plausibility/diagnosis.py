@@ -23,7 +23,7 @@ from .hint import Hint, hint_of
 PRIOR_LIMIT: Final = 3.0  # prior standard deviations from zero beyond which a calibration is reported
 
 
-CALIBRATION_CAUSES: Final = {  # words with a place for the size, size of a calibration of 1, words for the sign
+CALIBRATION_CAUSES: Final = {  # words, size of a calibration of 1 in them, words for the sign
     "scale": ("speeds are {:.1f} % too {}", 100.0, ("high", "low")),
     "bias": ("the yaw rate is {:.4f} rad/s too {}", 1.0, ("high", "low")),
     "yaw": ("the sensor is turned by {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")),
@@ -128,7 +128,7 @@ def noise_hints(log: Log, scale: float, *, stay: bool = True) -> list[Hint]:
 
 
 def _odometry_hints(log: Log, scale: float) -> list[Hint]:
-    """Compare white noise: too small only if all orders of differences agree; otherwise they contain motion."""
+    """Compare white noise: orders of differences that disagree contain motion as well."""
     twists = TwistRecord()
     twists.add(log.odometry)
     orders, white = twists.orders(), twists.white()

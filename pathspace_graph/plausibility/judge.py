@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 import scipy  # imports its modules lazily
+from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
@@ -53,10 +54,11 @@ def hints(log: Log) -> list[Hint]:
     of_cycles = gaps_and_reach(log)
     log, of_positions = positions_in_metres(log, scale)
     log, of_rows = possible_rows(log)
-    found += of_positions + of_rows + (camera(log, scale) or motion_hints(log, scale))
     stay = kind_of(log) in ("cones", None)
-    if not found and stay:
-        found = one_label(log) + side_hints(log)
+    with threadpool_limits(limits=1):
+        found += of_positions + of_rows + (camera(log, scale) or motion_hints(log, scale))
+        if not found and stay:
+            found = one_label(log) + side_hints(log)
     return of_cycles + (found or noise_hints(log, scale, stay=stay))
 
 
@@ -325,7 +327,7 @@ def unit_of(size: float, units: Mapping[float, str]) -> tuple[str, float]:
 
 
 def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log, scale: float) -> None:
-    """Tell whether the detections, or else the odometry, have other axes than the vehicle, or another origin."""
+    """Tell whether detections, or else the odometry, have other axes than the vehicle, or another origin."""
     explained, opposite = regression.explained(fit), regression.explained(replace(fit, rate=abs(fit.rate)))
     mirror, size = far_better(explained.turn, opposite.turn), max(abs(fit.gain), TINY)
     turn = float(np.angle(fit.gain, deg=True)) * (1.0 if mirror else -1.0)

@@ -55,7 +55,6 @@ FASTEST_START: Final = 30.0  # largest speed of these (m/s), beyond the first ri
 MATCHED: Final = 0.4  # least share of matched detections of a motion
 WELL_MATCHED: Final = 0.75  # share from which no further start is tried
 BETTER_MATCHED: Final = 0.1  # by how much more a later start must match
-MOST_TURNED: Final = 1.0  # largest turn of a motion (rad)
 WORST_CONDITION: Final = 1e8  # largest condition number of the information about a motion
 
 
@@ -90,11 +89,7 @@ def motions_of(
             starts = [relative(poses[k], poses[k + gap]), dt * twist, np.zeros(3)]
             share, motion, information = register(cycles[k], cycles[k + gap], starts, fastest * dt, fewest)
             tried += 1
-            if (
-                share > MATCHED
-                and abs(motion[2]) < MOST_TURNED
-                and np.linalg.cond(information) < WORST_CONDITION
-            ):
+            if share > MATCHED and np.linalg.cond(information) < WORST_CONDITION:
                 twist = twist_of(motion, dt)
                 rows.append([stamps[k], stamps[k + gap], *twist, *(np.linalg.inv(information) / dt**2).flat])
     table = np.array(sorted(rows, key=lambda row: row[0] + row[1])).reshape(-1, 14)
@@ -129,9 +124,9 @@ def register(
 
 def twist_of(motion: Array, dt: float) -> Array:
     """Return the constant twist (3,) of a motion (3,) in a time dt (s)."""
-    half = 0.5j * motion[2]
-    way = (motion[0] + 1j * motion[1]) * (half * np.exp(-half) / np.sinh(half) if motion[2] else 1.0)
-    return np.array([way.real, way.imag, motion[2]]) / dt
+    turn = motion[2]
+    way = (motion[0] + 1j * motion[1]) * np.exp(-0.5j * turn) / np.sinc(turn / (2.0 * pi))
+    return np.array([way.real, way.imag, turn]) / dt
 
 
 # --- regression ------------------------------------------------------------------------------------------
@@ -193,7 +188,7 @@ def far_better(one: Array, other: Array) -> Better | None:
     chance = float(scipy.special.bdtrc(int((difference[telling] > 0.0).sum()) - 1, int(telling.sum()), 0.5))
     if chance > BY_CHANCE or share < max(FAR_BETTER * less, LEAST_EXPLAINED):
         return None
-    words = f"{100.0 * less:.0f} % of the motions that the cones show, and {100.0 * share:.0f} % with the likely cause"
+    words = f"{100.0 * less:.0f} % of the cones' motions, {100.0 * share:.0f} % with the likely cause"
     return Better(float(difference.sum()), f"the odometry explains {words}")
 
 
