@@ -4,7 +4,7 @@ Good logs of all kinds are judged: what is unusual about them is no mistake.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import product
 from typing import Any, Final
 
@@ -15,88 +15,61 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.overrides import Overrides, override
 from pathspace_graph.labels import LEFT
 from pathspace_graph.plausibility.judge import hints
-from pathspace_graph.sim.mistakes import MISTAKES
+from pathspace_graph.sim.mistakes import MISTAKES, with_cycles
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track import Track
+from pathspace_graph.sim.simulate import preset, simulate
 
 from .cars import generated
 from .experiment.tables import Quantity, Table
 
 Row = dict[str, Any]
 
-AS_SIMULATED: Final = "as simulated"  # kind of good logs with nothing unusual
-_SELF_NAMED: Final = (
-    "positions",
-    "speeds",
-    "yaw rate",
-    "y to the right",
-    "stamps",
-    "odometry",
-    "covariances",
-)
 CAUSES: Final[dict[str, tuple[str, ...]]] = {  # that tell a mistake, by the longest beginning of its name
-    **{name: (name,) for name in _SELF_NAMED},
+    **{name: (name,) for name in ("positions", "speeds", "yaw rate", "y to the right", "stamps")},
+    **{name: (name,) for name in ("odometry", "covariances", "sides", "sensor frame")},
     "all lengths": ("positions", "speeds"),
     "bearings": ("unexplained",),
-    "sensor frame": ("sensor frame", "mounting"),
+    "sensor frame: 2 m ahead": ("mounting",),
     "speeds in the map frame": ("odometry",),
     "detections in the map frame": ("map frame",),
     "detections 1 s late": ("clocks",),
     "all labels": ("labels",),
 }
-
-
-# --- good logs -------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Good:
-    """A kind of good log: overrides of its simulation, a change of its track, and one of the log."""
-
-    overrides: Overrides = field(default_factory=dict)
-    road: Callable[[Track], Track] = lambda track: track
-    edit: Callable[[Log], Log] = lambda log: log
-
-    def log(self, track: Track, seed: int, laps: int) -> Log:
-        settings = override(SimulationSettings(laps=laps), self.overrides, "")
-        return self.edit(simulate(self.road(track), settings, seed))
-
-
-def open_road(track: Track) -> Track:
-    """Return the first half of a track."""
-    left, right = track.left[: len(track.left) // 2], track.right[: len(track.right) // 2]
-    return replace(track, left=left, right=right, closed=False)
-
-
-def one_boundary(log: Log) -> Log:
-    """Return the log with the detections of the left boundary only."""
-    return _kept(log, lambda cycle: cycle.labels == LEFT)
-
-
-def few_cones(log: Log) -> Log:
-    """Return the log with the three nearest detections of each cycle."""
-    return _kept(log, lambda cycle: np.argsort(np.argsort(np.hypot(*cycle.points_vehicle.T))) < 3)
-
-
-def _kept(log: Log, chosen: Callable[[Detections], np.ndarray]) -> Log:
-    kept = (cycle.where(chosen(cycle)) for cycle in log.cycles)
-    return replace(log, cycles=tuple(cycle for cycle in kept if len(cycle.labels)), truth=None)
-
-
-def stands_first(log: Log) -> Log:
-    """Return the log of a vehicle that stands for ten seconds first, with fresh noise in each detection."""
-    rng, odometry, first = np.random.default_rng(0), log.odometry, log.cycles[0]
-    before = np.arange(0.0, 10.0, 0.02)
-    twists = rng.normal(0.0, log.odometry_sigma, (len(before), 3))
-    roots, points, standing = np.linalg.cholesky(first.covariances), first.points_vehicle, []
-    for t in np.arange(0.0, 10.0, 0.1).tolist():
-        noise = np.einsum("mij,mj->mi", roots, rng.normal(size=points.shape))
-        standing.append(replace(first, t=t, points_vehicle=points + noise))
-    driving = [replace(cycle, t=cycle.t + 10.0) for cycle in log.cycles]
-    stamps = np.append(before, odometry.t - odometry.t[0] + 10.0)
-    whole = Odometry(stamps, np.vstack([twists, odometry.twist]))
-    return replace(log, odometry=whole, cycles=(*standing, *driving), truth=None)
+AS_SIMULATED: Final = "as simulated"  # kind of good logs with nothing unusual
+_SENSOR, _ODOMETRY = SensorSettings(), OdometryNoise()
+_NOISY: Final = {
+    **{f"sensor.{name}": 3.0 * getattr(_SENSOR, name) for name in ("range_sigma", "range_sigma_growth")},
+    "sensor.bearing_sigma": 3.0 * _SENSOR.bearing_sigma,
+    "odometry.white": tuple(3.0 * sigma for sigma in _ODOMETRY.white),
+    **{f"odometry.{name}": 3.0 * getattr(_ODOMETRY, name) for name in ("scale", "gyro_bias")},
+}
+SIMULATED: Final[dict[str, Overrides]] = {  # kinds of good logs, by what is unusual about their simulation
+    AS_SIMULATED: {},
+    **{f"field of view of {degrees} degrees": {"sensor.fov": np.deg2rad(degrees)} for degrees in (180, 360)},
+    **{f"range of {metres:g} m": {"sensor.range_max": metres} for metres in (5.0, 8.0, 20.0)},
+    "noise times 3": _NOISY,
+    **{f"{rate:g} cycles per second": {"sensor.rate": rate} for rate in (2.0, 5.0, 20.0)},
+    "30 % of the cones missed": {"sensor.detection_probability": 0.7, "sensor.blind_fraction": 0.15},
+    "5 false positives in a cycle": {"sensor.false_positives": 5.0},
+    "30 % wrong colours": {"sensor.wrong_colour": 0.3},
+    "without colours": {"faults.sensor.colourless": 1.0},
+    "yaw-rate bias of 0.02 rad/s": {"faults.odometry.yaw_rate_bias": 0.02},
+    "wheel slip of 50 %": {"faults.odometry.slip": 0.5},
+    "latency of 100 ms": {"faults.sensor.latency": 0.1},
+    "sensor turned by 2 degrees": {"faults.sensor.yaw": 0.0349},
+    "sensor 0.2 m to the left": {"faults.sensor.lateral": 0.2},
+    "ranges 4 % too long": {"faults.sensor.range_scale": 0.04},
+    "odometry missing for 2 s": {"faults.odometry.gap": 2.0},
+    "no detections for 5 s": {"faults.sensor.dropout": 5.0},
+    "driven the other way round": {"faults.vehicle.wrong_way": True},
+    "stands for 10 s first": {"vehicle.rest": 10.0},
+    "stands at the end, creeps by odometry": {"vehicle.stand": 8.0, "faults.odometry.false_travel": 3.0},
+    **{f"drawn car {number}": {"draw": True} for number in range(6)},
+}
+PRESET: Final = {  # kinds of good logs, by their presets
+    "camera and ins": {"sensor": "camera", "odometry": "ins"},
+    "points of lines": {"sensor": "line"},
+}
 
 
 def backs_up(log: Log) -> Log:
@@ -108,67 +81,54 @@ def backs_up(log: Log) -> Log:
 
 
 def in_unix_time(log: Log) -> Log:
-    odometry = replace(log.odometry, t=log.odometry.t + 1.7e9)
-    cycles = tuple(replace(cycle, t=cycle.t + 1.7e9) for cycle in log.cycles)
-    return replace(log, odometry=odometry, cycles=cycles, truth=None)
+    log = with_cycles(log, lambda cycle: {"t": cycle.t + 1.7e9})
+    return replace(log, odometry=replace(log.odometry, t=log.odometry.t + 1.7e9), truth=None)
 
 
-_SENSOR, _ODOMETRY = SensorSettings(), OdometryNoise()
-GOOD: Final = {
-    AS_SIMULATED: Good(),
-    "field of view of 180 degrees": Good({"sensor.fov": np.pi}),
-    "field of view of 360 degrees": Good({"sensor.fov": 2.0 * np.pi}),
-    **{f"range of {metres:g} m": Good({"sensor.range_max": metres}) for metres in (5.0, 8.0, 20.0)},
-    "noise times 3": Good(
-        {
-            "sensor.range_sigma": 3.0 * _SENSOR.range_sigma,
-            "sensor.range_sigma_growth": 3.0 * _SENSOR.range_sigma_growth,
-            "sensor.bearing_sigma": 3.0 * _SENSOR.bearing_sigma,
-            "odometry.white": tuple(3.0 * sigma for sigma in _ODOMETRY.white),
-            "odometry.scale": 3.0 * _ODOMETRY.scale,
-            "odometry.gyro_bias": 3.0 * _ODOMETRY.gyro_bias,
-        }
-    ),
-    **{f"{rate:g} cycles per second": Good({"sensor.rate": rate}) for rate in (2.0, 5.0, 20.0)},
-    "30 % of the cones missed": Good({"sensor.detection_probability": 0.7, "sensor.blind_fraction": 0.15}),
-    "5 false positives in a cycle": Good({"sensor.false_positives": 5.0}),
-    "30 % wrong colours": Good({"sensor.wrong_colour": 0.3}),
-    "without colours": Good({"faults.sensor.colourless": 1.0}),
-    "yaw-rate bias of 0.02 rad/s": Good({"faults.odometry.yaw_rate_bias": 0.02}),
-    "wheel slip of 50 %": Good({"faults.odometry.slip": 0.5}),
-    "latency of 100 ms": Good({"faults.sensor.latency": 0.1}),
-    "sensor turned by 2 degrees": Good({"faults.sensor.yaw": 0.0349}),
-    "sensor 0.2 m to the left": Good({"faults.sensor.lateral": 0.2}),
-    "ranges 4 % too long": Good({"faults.sensor.range_scale": 0.04}),
-    "odometry missing for 2 s": Good({"faults.odometry.gap": 2.0}),
-    "no detections for 5 s": Good({"faults.sensor.dropout": 5.0}),
-    "driven the other way round": Good({"faults.vehicle.wrong_way": True}),
-    "one boundary": Good(edit=one_boundary),
-    "three cones in a cycle": Good(edit=few_cones),
-    "stands for 10 s first": Good(edit=stands_first),
-    "backs up": Good(edit=backs_up),
-    "odometry at 10 Hz": Good(
-        edit=lambda log: replace(log, odometry=Odometry(log.odometry.t[::5], log.odometry.twist[::5]))
-    ),
-    "stamps since 1970": Good(edit=in_unix_time),
-    "open road": Good(road=open_road),
+def kept(log: Log, chosen: Callable[[Detections], np.ndarray]) -> Log:
+    cycles = (cycle.where(chosen(cycle)) for cycle in log.cycles)
+    return replace(log, cycles=tuple(cycle for cycle in cycles if len(cycle.labels)), truth=None)
+
+
+def every(log: Log, step: int, end: float = np.inf) -> Log:
+    """Return the log with some of the twists, up to a stamp (s)."""
+    odometry = Odometry(*(one[log.odometry.t <= end][::step] for one in (log.odometry.t, log.odometry.twist)))
+    return replace(log, odometry=odometry, cycles=tuple(cycle for cycle in log.cycles if cycle.t <= end))
+
+
+def _nearest_three(cycle: Detections) -> np.ndarray:
+    return np.asarray(np.argsort(np.argsort(np.hypot(*cycle.points_vehicle.T))) < 3)
+
+
+EDITED: Final[dict[str, Callable[[Log], Log]]] = {  # kinds of good logs, by how they are edited
+    "one boundary": lambda log: kept(log, lambda cycle: cycle.labels == LEFT),
+    "three cones in a cycle": lambda log: kept(log, _nearest_three),
+    "backs up": backs_up,
+    "odometry at 10 Hz": lambda log: every(log, 5),
+    "stamps since 1970": in_unix_time,
+    "open road": lambda log: every(log, 1, float(log.odometry.t.mean())),
 }
 
 
-# --- the measurement -------------------------------------------------------------------------------------
+def good_log(track: int, kind: str) -> Log:
+    """Return the good log of a kind; each drawn car is another one."""
+    settings = override(replace(preset(PRESET.get(kind, {})), laps=1), SIMULATED.get(kind, {}), "")
+    seed = track + 3 * list(SIMULATED).index(kind) if settings.draw else 0
+    log = simulate(generated(track), settings, seed)
+    return EDITED[kind](log) if kind in EDITED else log
 
 
 def parts_of(tracks: Sequence[int], mistakes: Sequence[str]) -> list[dict[str, Any]]:
     """Return the arguments of `judge`: good logs of all kinds, of which the plain ones are spoiled too."""
     return [
         {"track": track, "kind": kind, "mistakes": mistakes if kind == AS_SIMULATED else ()}
-        for track, kind in product(tracks, GOOD)
+        for track, kind in product(tracks, (*SIMULATED, *PRESET, *EDITED))
     ]
 
 
 def judge(track: int, kind: str, mistakes: Sequence[str]) -> list[Row]:
     """Return a row for the good log of a kind, and for each of those that are spoiled by mistakes."""
-    log = GOOD[kind].log(generated(track), seed=0, laps=1)
+    log = good_log(track, kind)
     spoiled = [{"name": name, **judged(MISTAKES[name](log), causes_of(name))} for name in mistakes]
     rows = [{"kind": "good", "name": kind, **judged(log)}, *({"kind": "spoiled", **row} for row in spoiled)]
     return [{"track": track, **row} for row in rows]

@@ -36,7 +36,7 @@ from pathspace_graph.lengths import scaled
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.options.map import Batch, MapKind, Online, Plot
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
-from pathspace_graph.plausibility.hint import Hint
+from pathspace_graph.plausibility.hint import Hint, objections
 from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.run import Observer, OnlineEstimator, run_online, with_own
 from pathspace_graph.settings.mapper import MapperSettings
@@ -82,7 +82,7 @@ def online_command(options: Online) -> Outcome:
     report(result, log)
     say(*(one.line for one in differ))
     crossed = crossings_told(crossings_of(result))
-    wrong = [f"not a map of the drive: {crossed}"] if crossed else []
+    wrong = objections(hints) + ([f"not a map of the drive: {crossed}"] if crossed else [])
     if known is not None and known.found_at(estimator) is None:
         wrong.append(f"the vehicle was not found on {options.on}: this is the map of its own road")
     files = (options.out, options.save, options.plot, options.save_view)
@@ -162,7 +162,7 @@ def batch_command(options: Batch) -> Outcome:
     summarized = summarize_batch(result, log, hints)
     write_result(options.out, result, summarized, force=options.force)
     report(result, log)
-    return Outcome([options.out], summarized, untrusted(result))
+    return Outcome([options.out], summarized, objections(hints) + untrusted(result))
 
 
 def batch_of_several(options: Batch) -> Outcome:
@@ -186,7 +186,8 @@ def batch_of_several(options: Batch) -> Outcome:
         laps = f"{drive.laps} lap{'' if drive.laps == 1 else 's'}"
         say(f"{name}: {laps}, begins at ({x:.2f}, {y:.2f}) m, turned by {np.rad2deg(heading):.2f}°")
     left_out = [f"{name} is left out: {why}" for name, why in joint.left_out.items()]
-    return Outcome([options.out], summarized, [*left_out, *untrusted(result)])
+    wrong = [f"{of}: {line}" for of in logs for line in objections(hints[of])]
+    return Outcome([options.out], summarized, [*left_out, *wrong, *untrusted(result)])
 
 
 def spline_batch(settings: MapperSettings, log: Log) -> BatchMapper:

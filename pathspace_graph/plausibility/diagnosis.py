@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.noise import ASSUMED_DRIFT, MeasuredNoise, RayNoise, ray_sigmas
+from pathspace_graph.factors.noise import ASSUMED_DRIFT, MeasuredNoise, ray_sigmas
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.gate import TWIST
@@ -17,7 +16,7 @@ from pathspace_graph.health import LOST
 from pathspace_graph.io.header import CALIBRATION
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
-from pathspace_graph.lengths import POSE_LENGTHS, Length, Text, joined, scaled
+from pathspace_graph.lengths import POSE_LENGTHS, scaled
 from pathspace_graph.spline.crossing import Crossing, crossed_boundaries
 
 from .hint import Hint, hint_of
@@ -25,26 +24,20 @@ from .hint import Hint, hint_of
 PRIOR_LIMIT: Final = 3.0  # prior standard deviations from zero beyond which a calibration is reported
 
 
-class Cause(NamedTuple):
-    """Meaning of a calibration."""
-
-    template: str  # cause, with a place for the size
-    unit: float  # size in words of a calibration of 1
-    signs: tuple[str, str]  # words for a positive and a negative calibration
-
-    def text_of(self, value: float) -> str:
-        return self.template.format(self.unit * abs(value), self.signs[0 if value > 0.0 else 1])
-
-
-CALIBRATION_CAUSES: Final = {  # by the name of the calibration
-    "scale": Cause("speeds are {:.1f} % too {}", 100.0, ("high", "low")),
-    "bias": Cause("the yaw rate is {:.4f} rad/s too {}", 1.0, ("high", "low")),
-    "yaw": Cause("the sensor is turned by {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")),
-    "lateral": Cause("the sensor sits {:.2f} m too far to the {}", 1.0, ("left", "right")),
-    "latency": Cause("detections are {:.0f} ms {} than their stamps", 1e3, ("older", "newer")),
-    "range_scale": Cause("ranges are {:.1f} % too {}", 100.0, ("long", "short")),
-    "range_bias": Cause("ranges are {:.2f} m too {}", 1.0, ("long", "short")),
+CALIBRATION_CAUSES: Final = {  # words, size of a calibration of 1 in them, words for the sign
+    "scale": ("speeds are {:.1f} % too {}", 100.0, ("high", "low")),
+    "bias": ("the yaw rate is {:.4f} rad/s too {}", 1.0, ("high", "low")),
+    "yaw": ("the sensor is turned by {:.1f} degrees to the {}", 180.0 / np.pi, ("left", "right")),
+    "lateral": ("the sensor sits {:.2f} m too far to the {}", 1.0, ("left", "right")),
+    "latency": ("detections are {:.0f} ms {} than their stamps", 1e3, ("older", "newer")),
+    "range_scale": ("ranges are {:.1f} % too {}", 100.0, ("long", "short")),
+    "range_bias": ("ranges are {:.2f} m too {}", 1.0, ("long", "short")),
 }
+
+
+def cause_of(name: str, value: float) -> str:
+    words, unit, (positive, negative) = CALIBRATION_CAUSES[name]
+    return words.format(unit * abs(value), positive if value > 0.0 else negative)
 
 
 def by_prior(state: VehicleState, settings: Mapping[str, Any], scale: float = 1.0) -> dict[str, float]:
@@ -59,12 +52,13 @@ def by_prior(state: VehicleState, settings: Mapping[str, Any], scale: float = 1.
 
 
 def diagnose(state: VehicleState, settings: Mapping[str, Any], scale: float = 1.0) -> list[str]:
-    """Return a line for each calibration beyond `PRIOR_LIMIT`, with its cause."""
+    """Return a line for each calibration beyond `PRIOR_LIMIT`, with its cause and whether it is certain."""
     lines = []
     for name, ratio in by_prior(state, settings, scale).items():
+        value, sigma = map(float, state.by_name[name])
         if abs(ratio) > PRIOR_LIMIT:
-            text = CALIBRATION_CAUSES[name].text_of(float(state.by_name[name][0]))
-            lines.append(f"{text} ({abs(ratio):.1f} sigmas of its prior)")
+            certainty = "certain" if abs(value) > CLEAR_ERROR * sigma else "uncertain"
+            lines.append(f"{cause_of(name, value)} ({certainty})")
     return lines
 
 
@@ -103,107 +97,96 @@ def measured_line(measured: MeasuredNoise, scale: float = 1.0) -> str:
     line = f"measured: odometry {forward} m/s, {sideways} m/s, {turning} rad/s from sample to sample"
     if measured.along is None or measured.across is None:
         return line
-    rays = measured.along, measured.across
-    at = NOISE_RANGE * scale
+    rays, at = (measured.along, measured.across), NOISE_RANGE * scale
     along, across = (float(ray.sigmas(np.array([at]))[0]) for ray in rays)
     line += f"; detections {along:.2g} m along and {across:.2g} m across the ray at {at:g} m"
     if max(ray.share for ray in rays) > CORRELATED_SHARE:
         shares = " and ".join(f"{100.0 * ray.share:.0f} %" for ray in rays)
         times = " and ".join(f"{ray.time:g} s" for ray in rays)
         line += f", of which {shares} of the variance stay with a cone for {times}"
-    errors = _errors(measured, scale)
-    return f"{line}; {', '.join(errors)}" if errors else line
-
-
-def _errors(measured: MeasuredNoise, scale: float) -> list[str]:
-    worth = {name: scale * least if name in IN_METRES else least for name, least in ERROR_WORTH.items()}
     errors = zip(SENSOR, measured.sensor.tolist(), measured.sensor_sigma.tolist(), strict=True)
-    return [
-        CALIBRATION_CAUSES[name].text_of(value)
+    clear = [
+        cause_of(name, value)
         for name, value, sigma in errors
-        if abs(value) > max(CLEAR_ERROR * sigma, worth[name])
+        if abs(value) > max(CLEAR_ERROR * sigma, ERROR_WORTH[name] * (scale if name in IN_METRES else 1.0))
     ]
+    return f"{line}; {', '.join(clear)}" if clear else line
 
 
 NOISE_FACTOR: Final = 1.5  # least ratio of measured and stated noise of the odometry for a hint
 NOISE_AGREEMENT: Final = 1.2  # largest ratio between the orders of differences of white noise
 SCATTER_FACTOR: Final = 2.0  # least ratio of measured and stated noise of detections for a hint
+UNIT_FACTOR: Final = 10.0  # least ratio that tells another unit
 NOISE_SHARE: Final = 0.75  # least share of the detections with wrong covariances
 NOISE_CYCLES: Final = 300  # largest number of cycles on which the noise of detections is measured
 
 
-def noise_hints(log: Log, *, stay: bool = True) -> list[Hint]:
-    """Return hints where the readings contradict the stated noise by a large factor.
+def noise_hints(log: Log, scale: float, *, stay: bool = True) -> list[Hint]:
+    """Return hints where the readings of a log at scale 1 contradict the stated noise by a large factor.
 
     The noise of detections is measurable only if they `stay` in place, as cones do.
     """
-    found = _odometry_hints(log) if log.odometry_stated else []
-    return found + (_detection_hints(log) if log.detections_stated and stay else [])
+    found = _odometry_hints(log, scale) if log.odometry_stated else []
+    return found + (_detection_hints(log, scale) if log.detections_stated and stay else [])
 
 
-def _odometry_hints(log: Log) -> list[Hint]:
-    """Return hints where the white noise of the odometry contradicts the stated one.
-
-    The stated noise is too small only if all orders of differences agree; otherwise they contain motion.
-    """
+def _odometry_hints(log: Log, scale: float) -> list[Hint]:
+    """Compare white noise: orders of differences that disagree contain motion as well."""
     twists = TwistRecord()
     twists.add(log.odometry)
     orders, white = twists.orders(), twists.white()
     if orders is None or white is None:
         return []
-    least, interval = white
+    (least, interval), stated, hints = white, log.odometry_sigma, []
     agree = orders.max(axis=0) < NOISE_AGREEMENT * least
-    small = agree & (least > NOISE_FACTOR * log.odometry_sigma)
     most = np.hypot(least, np.array(ASSUMED_DRIFT) / np.sqrt(interval))
-    large = NOISE_FACTOR * most < log.odometry_sigma
-    stated, hints = log.odometry_sigma, []
-    for which, values, size in ((small, least, "small"), (large, most, "large")):
-        figures = [_scatter(k, float(values[k]), float(stated[k])) for k in np.flatnonzero(which).tolist()]
+    units = [scale**power for power in POSE_LENGTHS]
+    for which, values, size in (
+        (agree & (least > NOISE_FACTOR * stated), least, "small"),
+        (NOISE_FACTOR * most < stated, most, "large, unless it stands for errors that change slowly"),
+    ):
+        figures = [
+            f"{name} scatters by {value:.2g} {TWIST[name]}, and {said:.2g} is stated"
+            for name, value, said, chosen in zip(TWIST, values * units, stated * units, which, strict=True)
+            if chosen
+        ]
         if figures:
-            slow = ", unless it stands for errors that change slowly" if size == "large" else ""
-            hints.append(hint_of("noise of odometry", figures=joined(figures, ", "), size=size + slow))
+            hints.append(hint_of("noise of odometry", figures=", ".join(figures), size=size))
     return hints
 
 
-def _scatter(component: int, value: float, stated: float) -> Text:
-    """Return the measured and the stated noise of a component of the twist in words."""
-    (name, unit), power = list(TWIST.items())[component], POSE_LENGTHS[component]
-    template = "{name} scatters by {value:.2g} {unit}, and {stated:.2g} is stated"
-    return Text(template, name=name, unit=unit, value=Length(value, power), stated=Length(stated, power))
+def _detection_hints(log: Log, scale: float) -> list[Hint]:
+    """Compare standard deviations along the ray or across it, whichever is farther off.
 
-
-def _detection_hints(log: Log) -> list[Hint]:
-    cycles = log.cycles[:NOISE_CYCLES]
+    The size of a cone is the least noise; tracking with a gate limits the largest measurable noise.
+    """
+    cycles, found = log.cycles[:NOISE_CYCLES], dict[float, Hint]()
     measured = measure_log(replace(log, cycles=cycles))
     if measured is None or measured.along is None or measured.across is None:
         return []
     points = np.concatenate([cycle.points_vehicle for cycle in cycles])
-    sigmas = ray_sigmas(points, np.concatenate([cycle.covariances for cycle in cycles]))
-    ranges = np.hypot(*points.T)
-    near = ranges < FOLLOW_RANGE
-    hints = []
-    for axis, (name, ray) in enumerate((("along", measured.along), ("across", measured.across))):
-        size = _contradicted(ranges[near], sigmas[near, axis], ray, axis)
-        if size:
-            at = float(np.median(ranges[near]))
-            scatter = float(ray.sigmas(np.array([at]))[0])
-            stated = scatter * float(np.median(sigmas[near, axis] / ray.sigmas(ranges[near])))
-            figures = {"scatter": Length(scatter), "at": Length(at), "stated": Length(stated)}
-            hints.append(hint_of("noise of detections", way=name, size=size, **figures))
-    return hints
-
-
-def _contradicted(ranges: Array, stated: Array, ray: RayNoise, axis: int) -> str:
-    """Return whether stated sigmas (m,) are `small` or `large`, or neither (empty).
-
-    The size of a cone is the least noise; tracking with a gate limits the largest measurable noise.
-    """
-    measured = ray.sigmas(ranges)
-    floor = np.array([np.full(len(ranges), LEAST_NOISE[0]), LEAST_NOISE[1] * ranges])[axis]
-    small = measured > SCATTER_FACTOR * np.maximum(stated, floor)
+    stated = ray_sigmas(points, np.concatenate([cycle.covariances for cycle in cycles]))
+    near = (ranges := np.hypot(*points.T)) < FOLLOW_RANGE
+    ranges, stated, at = ranges[near], stated[near], float(np.median(ranges[near]))
     gate = np.minimum(GATE_UNKNOWN[0] + GATE_UNKNOWN[1] * ranges, GATE_UNKNOWN[2])
-    large = (SCATTER_FACTOR * measured < stated) & (3.0 * measured < gate)
-    for size, which in (("small", small), ("large", large)):
-        if len(which) and which.mean() > NOISE_SHARE:
-            return size
-    return ""
+    floors = np.full(len(ranges), LEAST_NOISE[0]), LEAST_NOISE[1] * ranges
+    rays = ("along", measured.along), ("across", measured.across)
+    for (way, ray), claimed, floor in zip(rays, stated.T, floors, strict=True):
+        sigmas, scatter = ray.sigmas(ranges), scale * float(ray.sigmas(np.array([at]))[0])
+        small = (sigmas > SCATTER_FACTOR * np.maximum(claimed, floor)).mean()
+        large = ((SCATTER_FACTOR * sigmas < claimed) & (3.0 * sigmas < gate)).mean()
+        if max(small, large) > NOISE_SHARE:
+            ratio = float(np.median(claimed / sigmas))
+            is_unit = not 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR
+            how = f"too {'small' if small > large else 'large'}"
+            how += ", as in another unit, or there are none at all" if is_unit else ""
+            figures = {
+                "scatter": scatter,
+                "at": scale * at,
+                "stated": scatter * ratio,
+                "way": way,
+                "how": how,
+            }
+            cause = "covariances" if is_unit else "noise"
+            found[max(small, large)] = hint_of("noise of detections", cause=cause, **figures)
+    return [found[max(found)]] if found else []

@@ -1,12 +1,16 @@
 """Check of a log before it is mapped: hints about likely mistakes, also for a log that is refused."""
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import chain
+from math import hypot
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+import scipy  # imports its modules lazily
+from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
@@ -18,357 +22,365 @@ from pathspace_graph.io.covariances import covariances_of
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.io.parsing import read_table, shown
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
-from pathspace_graph.lengths import Length, scaled
+from pathspace_graph.lengths import scaled
 from pathspace_graph.scale import scale_of
-from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 
-from . import hypotheses
 from .diagnosis import noise_hints
 from .hint import Hint, because, hint_of
-from .hypotheses import AS_WRITTEN, DEGREE, Hypothesis, Mounting, Pairs, Trial, Trials, far_better
+from .regression import Better, Complex, Fit, Regression, far_better, motions_of
 
-LEAST_TWISTS: Final = 20  # least number of twists for hints
-LEAST_CYCLES: Final = 100  # least number of cycles whose typical number of detections tells the sensor's
-PAIR_OVERLAP: Final = 0.5  # least share of detections in view of both cycles of a compared pair
-SHORTEST_STEP: Final = 2e-4  # shortest usual time between rows (s)
-LONGEST_STEP: Final = 5.0  # longest usual time between rows (s)
-WITHOUT_DETECTIONS: Final = 10.0  # longest drive before the first detection or after the last one (s)
-DRIVING: Final = 0.1  # least share of the largest speed while driving
-FARTHEST_RANGE: Final = 120.0  # largest typical range of cones (m)
-DECISIVE_RANGE: Final = 20.0  # typical range that decides between two possible units (m)
-NEAREST_RANGE: Final = 0.05  # least typical range of cones (m)
-FASTEST: Final = 100.0  # speed that no vehicle exceeds in a tenth of its time (m/s)
-FASTEST_TURN: Final = 8.0  # yaw rate that no vehicle exceeds in a tenth of its time (rad/s)
-TURN_TOLD: Final = 5.0  # least yaw of the sensor for a hint (degrees)
-TURN_SIGMA: Final = 1.0  # largest standard deviation of the yaw for a hint (degrees)
-ARM_TOLD: Final = 1.0  # least lever arm of the sensor for a hint (m)
-ARM_SIGMA: Final = 0.2  # largest relative standard deviation of the lever arm for a hint
-CLAIMED_LESS: Final = 10.0  # ratio of actual to claimed scatter from which covariances are too small
-CLAIMED_MORE: Final = 30.0  # ratio of claimed to actual scatter from which covariances are too large
-LEAST_SCATTER: Final = 0.02  # lower bound of the actual scatter in that ratio (m)
-BOTH_SIDES: Final = 0.15  # largest deviation from 0.5 of the share of a label that is on both sides
-SAME_CONES: Final = 0.25  # largest motion over the range, and turn (rad), of cycles that see the same cones
-SAME_CONES_SEEN: Final = 6  # least number of detections of such a pair of cycles
-SAME_CONES_PAIRS: Final = 30  # least number of such pairs
-UNEXPLAINED: Final = 0.15  # least explained share by the best motion on such pairs
-LINE_RATIO: Final = 0.1  # largest ratio of the spreads of two coordinates of detections on a line
-TIME_UNITS: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size (s)
-LENGTH_UNITS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # by size (m)
-FRAME_MEANINGS: Final = {  # words for frames of detections, by rotation (degrees) and whether mirrored
-    (180.0, False): "the sensor's frame has x to the rear and y to the right",
-    (-90.0, False): "the sensor's frame has x to the right and y ahead",
-    (90.0, False): "the sensor's frame has x to the left and y to the rear",
-    (90.0, True): "the columns x and y are swapped",
-    (180.0, True): "the sensor's frame has x to the rear",
-    (-90.0, True): "the sensor's frame has x to the right and y to the rear",
-}
 LARGEST_READING: Final = 1e20  # largest number in a log for hints
-MIRRORED: Final = 0.0, True  # frame in which y points to the right and x ahead
+LEAST_TWISTS: Final = 20  # least number of twists for hints
 
 
 def hints(log: Log) -> list[Hint]:
-    """Return hints about likely mistakes in a log; none for weak evidence or numbers that are not finite."""
+    """Return hints about likely mistakes in a log; those by motion are the strongest first.
+
+    There are none for weak evidence, nor for numbers that are not finite.
+    """
     check_type("log", log, Log)
-    if len(log.odometry.t) < LEAST_TWISTS or not _has_numbers(log):
-        return []
-    scale = scale_of(log)
-    return [scaled(hint, scale) for hint in _hints(scaled(log, 1.0 / scale))]
-
-
-def _has_numbers(log: Log) -> bool:
     arrays = ((cycle.points_vehicle, cycle.covariances) for cycle in log.cycles)
     parts = (*_stamps(log).values(), log.odometry.twist, *chain.from_iterable(arrays))
-    return all((np.abs(part) <= LARGEST_READING).all() for part in parts)
-
-
-def _hints(log: Log) -> list[Hint]:
-    of_parts = whole_stamps(log)
-    if of_parts:
+    if len(log.odometry.t) < LEAST_TWISTS or any(not (np.abs(one) <= LARGEST_READING).all() for one in parts):
+        return []
+    if of_parts := parts_of_stamps(log):
         return of_parts
     log, found = stamps_in_seconds(log)
-    of_clocks = one_clock(log)
-    if of_clocks:
+    if of_clocks := one_clock(log):
         return found + of_clocks
-    of_ends = ends_apart(log) + few_detections(log)
-    log, of_positions = positions_in_metres(log)
-    found += of_positions
-    pairs = hypotheses.pairs_of(log.cycles)
-    if pairs is None:
-        return of_ends + found + beyond_any_vehicle(log.odometry)
-    trials = Trials(log, telling_pairs(log, pairs))
-    others = _reading_hints(trials, found)
-    if others and MapperSettings(kind=kind_of(log)).lines:
-        others = _reading_hints(trials, found, stay=False)
-    return of_ends + others
+    scale = scale_of(log)
+    log = scaled(log, 1.0 / scale)
+    of_cycles = gaps_and_reach(log)
+    log, of_positions = positions_in_metres(log, scale)
+    log, of_rows = possible_rows(log)
+    stay = kind_of(log) in ("cones", None)
+    with threadpool_limits(limits=1):
+        found += of_positions + of_rows + (camera(log, scale) or motion_hints(log, scale))
+        if not found and stay:
+            found = one_label(log) + side_hints(log)
+    return of_cycles + (found or noise_hints(log, scale, stay=stay))
 
 
-def _reading_hints(trials: Trials, found: list[Hint], *, stay: bool = True) -> list[Hint]:
-    """Return hints `found` and hints by motion or, if there are none, hints about noise."""
-    return found + _motion_hints(trials, stay=stay) or noise_hints(trials.log, stay=stay)
+# --- stamps, units and rows by typical values ------------------------------------------------------------
+
+TIME_UNITS: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size (s)
+LENGTH_UNITS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # by size (m)
+USUAL_STEPS: Final = 2e-4, 5.0  # shortest and longest usual time between rows (s)
+WITHOUT_DETECTIONS: Final = 10.0  # longest drive before the first detection or after the last one (s)
+DRIVING: Final = 0.1  # least share of the largest speed while driving
+LEAST_CYCLES: Final = 100  # least number of cycles whose typical number of detections tells the sensor's
+USUAL_RANGES: Final = 0.05, 20.0, 120.0  # typical ranges of cones: least, of the likelier unit, most (m)
+FASTEST: Final = 100.0, 8.0  # speed (m/s) and yaw rate (rad/s) that no vehicle exceeds in a tenth of its time
+LARGEST_STEPS: Final = 10.0, 10.0, 5.0  # from the rows around to a row that can be (m/s, m/s, rad/s)
+USUAL: Final = 0.9  # and at most this quantile of the column
+MOST_STEPS: Final = 0.02  # largest share of rows that cannot be
+LINE_RATIO: Final = 0.1  # largest ratio of the spreads of two coordinates of detections on a line
+BOTH_SIDES: Final = 0.15  # largest deviation from 0.5 of the share of a label that is on both sides
 
 
-# --- units by typical values -----------------------------------------------------------------------------
-
-
-def whole_stamps(log: Log) -> list[Hint]:
+def parts_of_stamps(log: Log) -> list[Hint]:
     """Return a hint for each file whose stamps have only whole seconds, or only fractions of a second."""
     found = []
     for file, t in _stamps(log).items():
-        falls = np.flatnonzero(np.diff(t) < 0.0)
-        if len(falls) >= 2 and np.ptp(t) <= max(1.0, 1.0 / min(TIME_UNITS)):
-            found.append(
-                hint_of("fraction of seconds", file=file, falls=len(falls), low=t.min(), high=t.max())
-            )
+        falls, seconds, fraction = int((np.diff(t) < 0.0).sum()), "whole seconds", "fraction of each second"
+        if falls >= 2 and np.ptp(t) <= max(1.0, 1.0 / min(TIME_UNITS)):
+            how = f"fall {falls} times and stay between {t.min():.4g} and {t.max():.4g}"
+            found.append(hint_of("part of stamps", file=file, how=how, part=fraction, rest=seconds))
         elif len(t) > 2 and (np.diff(t) == 0.0).mean() > 0.5 and (t == np.floor(t)).all():
-            found.append(hint_of("whole seconds", file=file, rows=len(t) / len(np.unique(t))))
+            how = f"are whole numbers, {len(t) / len(np.unique(t)):.0f} rows to each"
+            found.append(hint_of("part of stamps", file=file, how=how, part=seconds, rest=fraction))
     return found
 
 
 def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
     """Return the log with stamps in seconds, and a hint for each file with another unit."""
-    found, factors = [], {}
+    found, sizes = [], dict.fromkeys(_stamps(log), 1.0)
     for file, t in _stamps(log).items():
-        step = _median(np.abs(np.diff(t)))
-        fitting = [one for one in TIME_UNITS if SHORTEST_STEP <= step * one <= LONGEST_STEP]
-        if step > LONGEST_STEP and fitting:
-            unit = factors[file] = fitting[0]
-            found.append(hint_of("unit of stamps", file=file, step=step, unit=TIME_UNITS[unit], factor=unit))
-    if not factors:
+        step, (shortest, longest) = _median(np.abs(np.diff(t))), USUAL_STEPS
+        fitting = [size for size in TIME_UNITS if shortest <= step * size <= longest]
+        if step > longest and fitting:
+            size = sizes[file] = fitting[0]
+            found.append(hint_of("unit of stamps", file=file, step=step, unit=TIME_UNITS[size], size=size))
+    if not found:
         return log, []
-    of_odometry, of_cycles = (factors.get(file, 1.0) for file in (ODOMETRY_FILE, DETECTIONS_FILE))
-    odometry = replace(log.odometry, t=log.odometry.t * of_odometry)
-    cycles = tuple(replace(cycle, t=cycle.t * of_cycles) for cycle in log.cycles)
+    odometry = replace(log.odometry, t=log.odometry.t * sizes[ODOMETRY_FILE])
+    cycles = tuple(replace(cycle, t=cycle.t * sizes[DETECTIONS_FILE]) for cycle in log.cycles)
     return replace(log, odometry=odometry, cycles=cycles), found
 
 
 def one_clock(log: Log) -> list[Hint]:
-    if not log.cycles:
-        return []
-    first, last = float(log.odometry.t[0]), float(log.odometry.t[-1])
-    begin, end = log.cycles[0].t, log.cycles[-1].t
-    apart = begin > last or end < first
-    return [hint_of("two clocks", begin=begin, end=end, first=first, last=last)] if apart else []
+    t, stamps = log.odometry.t, [cycle.t for cycle in log.cycles] or [float(log.odometry.t[0])]
+    apart = stamps[0] > t[-1] or stamps[-1] < t[0]
+    return [hint_of("two clocks", begin=stamps[0], end=stamps[-1], first=t[0], last=t[-1])] if apart else []
 
 
-def ends_apart(log: Log) -> list[Hint]:
-    """Return a hint if the vehicle drives long before the first detection, or after the last one."""
+def gaps_and_reach(log: Log) -> list[Hint]:
+    """Return hints if the vehicle drives without detections at an end, or if most cycles have hardly any."""
     if not log.cycles:
         return []
-    t, speed = log.odometry.t, np.hypot(log.odometry.twist[:, 0], log.odometry.twist[:, 1])
+    t, speed, begin, end = log.odometry.t, _speeds(log), log.cycles[0].t, log.cycles[-1].t
     driven = t[speed > DRIVING * speed.max()]
-    begin, end = log.cycles[0].t, log.cycles[-1].t
-    found = []
-    if driven.size and begin - driven[0] > WITHOUT_DETECTIONS:
-        found.append(hint_of("detections begin late", seconds=begin - t[0]))
-    if driven.size and driven[-1] - end > WITHOUT_DETECTIONS:
-        found.append(hint_of("detections end early", seconds=t[-1] - end))
-    return found
-
-
-def few_detections(log: Log) -> list[Hint]:
-    """Return a hint if the typical cycle has too few detections for scan matching to check the odometry."""
+    early = driven.size and begin - driven[0] > WITHOUT_DETECTIONS
+    late = driven.size and driven[-1] - end > WITHOUT_DETECTIONS
+    found = [hint_of("detections begin late", seconds=begin - t[0])] if early else []
+    found += [hint_of("detections end early", seconds=t[-1] - end)] if late else []
     typical = _median(np.array([len(cycle.labels) for cycle in log.cycles]))
-    if len(log.cycles) < LEAST_CYCLES or typical >= MIN_MATCHED:
-        return []
-    return [hint_of("few detections", count=typical, least=MIN_MATCHED)]
+    few = len(log.cycles) >= LEAST_CYCLES and typical < MIN_MATCHED
+    return found + ([hint_of("few detections", count=typical, least=MIN_MATCHED)] if few else [])
 
 
-def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
-    typical = _median(np.concatenate([np.zeros(0), *(np.hypot(*c.points_vehicle.T) for c in log.cycles)]))
-    if typical > FARTHEST_RANGE:
-        unit = next((unit for unit in LENGTH_UNITS if typical * unit <= DECISIVE_RANGE), min(LENGTH_UNITS))
-        what = f"are in {LENGTH_UNITS[unit]}, not in metres"
-    elif 0.0 < typical < NEAREST_RANGE:
-        unit, what = 1e3, "were divided by 1000 although they were in metres"
+def positions_in_metres(log: Log, scale: float = 1.0) -> tuple[Log, list[Hint]]:
+    typical, (least, likely, most) = _median(np.abs(_points(log))), USUAL_RANGES
+    if typical > most:
+        size = next((size for size in LENGTH_UNITS if typical * size <= likely), min(LENGTH_UNITS))
+        what = f"are in {LENGTH_UNITS[size]}, not in metres"
+    elif 0.0 < typical < least:
+        size, what = 1e3, "were divided by 1000 although they were in metres"
     else:
         return log, []
-    cycles = [replace(cycle, points_vehicle=cycle.points_vehicle * unit) for cycle in log.cycles]
-    hint = hint_of("unit of positions", typical=Length(typical), what=what, factor=unit)
-    return replace(log, cycles=tuple(cycles)), [hint]
+    cycles = tuple(replace(cycle, points_vehicle=cycle.points_vehicle * size) for cycle in log.cycles)
+    hint = hint_of("unit of positions", typical=scale * typical, what=what, size=size)
+    return replace(log, cycles=cycles), [hint]
 
 
-def beyond_any_vehicle(odometry: Odometry) -> list[Hint]:
-    speed = float(np.quantile(np.hypot(odometry.twist[:, 0], odometry.twist[:, 1]), 0.9))
-    rate = float(np.quantile(np.abs(odometry.twist[:, 2]), 0.9))
-    found = [hint_of("too fast", speed=Length(speed))] if speed > FASTEST else []
-    return [*found, hint_of("turns too fast", rate=rate)] if rate > FASTEST_TURN else found
+def possible_rows(log: Log) -> tuple[Log, list[Hint]]:
+    """Return the log without steps of the odometry that cannot be, and a hint about these rows."""
+    twist = log.odometry.twist
+    smooth = scipy.ndimage.median_filter(twist, size=(5, 1), mode="nearest")
+    step = np.abs(twist - smooth)
+    wrong = step > np.maximum(LARGEST_STEPS, np.quantile(np.abs(twist), USUAL, axis=0))
+    if not 0 < wrong.any(axis=1).sum() < MOST_STEPS * len(twist):
+        return log, []
+    row, count = int((step * wrong).max(axis=1).argmax()), int(wrong.any(axis=1).sum())
+    figures = {"count": count, "total": len(twist), "step": step[row].max(), "row": row + 2}
+    hint = hint_of("yaw wraps" if wrong[:, 2].any() else "positions jump", **figures)
+    return replace(log, odometry=replace(log.odometry, twist=np.where(wrong, smooth, twist))), [hint]
+
+
+def beyond_any_vehicle(log: Log, scale: float) -> list[Hint]:
+    speed, rate = (np.quantile(one, 0.9) for one in (_speeds(log), np.abs(log.odometry.twist[:, 2])))
+    found = [hint_of("too fast", speed=scale * speed)] if speed > FASTEST[0] else []
+    return found + ([hint_of("turns too fast", rate=rate)] if rate > FASTEST[1] else [])
+
+
+def camera(log: Log, scale: float) -> list[Hint]:
+    """Return a hint if the detections lie on a line, as with the axes of a camera."""
+    points = _points(log)
+    spread = scale * np.array([points.real.std(), points.imag.std()]) if len(points) else np.ones(2)
+    least, most = spread.min(), spread.max()
+    in_line = least < LINE_RATIO * most
+    return [hint_of("camera", thin="xy"[int(spread.argmin())], least=least, most=most)] if in_line else []
+
+
+def one_label(log: Log) -> list[Hint]:
+    share, labels = sided(log), set(np.unique(_labels(log)).tolist())
+    if labels not in ({LEFT}, {RIGHT}) or abs(share - 0.5) > BOTH_SIDES:
+        return []
+    return [hint_of("one label", label=NAMES[labels.pop()], share=100.0 * share)]
+
+
+def sided(log: Log, turn: complex = 1.0, *, mirrored: bool = False) -> float:
+    """Return the share of near labels on their side, once a mirrored frame is turned; 0.5 without labels."""
+    points, labels = _points(log), _labels(log)
+    near = np.isin(labels, (LEFT, RIGHT)) & (np.abs(points) < _median(np.abs(points)))
+    left = ((points.conj() if mirrored else points)[near] * turn).imag > 0.0
+    return float((left == (labels[near] == LEFT)).mean()) if near.any() else 0.5
 
 
 def _stamps(log: Log) -> dict[str, Array]:
     return {ODOMETRY_FILE: log.odometry.t, DETECTIONS_FILE: np.array([cycle.t for cycle in log.cycles])}
 
 
+def _points(log: Log) -> Complex:
+    return np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in log.cycles)]) @ [1.0, 1j]
+
+
+def _labels(log: Log) -> Array:
+    return np.concatenate([np.zeros(0, int), *(cycle.labels for cycle in log.cycles)])
+
+
+def _speeds(log: Log) -> Array:
+    return np.asarray(np.hypot(*log.odometry.twist[:, :2].T))
+
+
 def _median(values: Array) -> float:
     return float(np.median(values)) if len(values) else 0.0
 
 
-# --- motion of the detections ----------------------------------------------------------------------------
+# --- the regression in words -----------------------------------------------------------------------------
+
+SPEED_UNITS: Final = {1.0 / 3.6: "km/h", 0.44704: "mph", 0.514444: "knots", 1e-2: "cm/s", 1e-3: "mm/s"}
+RATE_UNITS: Final = {float(np.pi / 180.0): "degrees per second"}
+SAME_FACTOR: Final = 1.2  # largest ratio of a factor and a unit
+FACTOR_TOLD: Final = 1.6  # least factor, or its inverse, that is told if it is no unit
+TINY: Final = 1e-9  # least size of a factor
+LATE_TOLD: Final = 0.2  # least lag that is told (s): less is left to the calibration
+TURN_TOLD: Final = 8.5  # least yaw of the sensor that is told (degrees)
+TURN_SIGMA: Final = 1.0  # largest standard deviation of the yaw (degrees)
+LEVER_TOLD: Final = 1.0  # least lever arm of the sensor that is told (m)
+LEVER_SIGMA: Final = 0.2  # largest relative standard deviation of the lever arm
+FLAT: Final = 0.2  # largest size of a missing rate, by what the cones show
+AT_REST: Final = 0.03  # largest difference of explained shares between no motion and the best fit
+LEAST_MOTIONS: Final = 20  # least number of motions for a regression
+LEAST_PAIRS: Final = 30  # least number of pairs of cycles that can show no motion,
+UNEXPLAINED: Final = 30.0, 0.2  # with at most this share of them that do (%), explained to this degree
+WELL_EXPLAINED: Final = 0.5  # least explained share for a small turn and a place, and for another drive
+FAR_LESS: Final = 0.4  # largest share that a fit explains of another drive, by what the cones show
+SIDES_TOLD: Final = 0.015  # least difference between the lags of both sides that is told (s),
+SIDES_CLEAR: Final = 4.0  # and in standard deviations
+SIDES: Final = 2000, 300  # approximate number of cycles of a side in use, and least number of motions
+FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation (degrees) and whether mirrored
+    (180, False): ("the sensor's frame has x to the rear and y to the right", "-x", "-y"),
+    (-90, False): ("the sensor's frame has x to the right and y ahead", "y", "-x"),
+    (90, False): ("the sensor's frame has x to the left and y to the rear", "-y", "x"),
+    (90, True): ("the columns x and y are swapped", "y", "x"),
+    (180, True): ("the sensor's frame has x to the rear", "-x", "y"),
+    (-90, True): ("the sensor's frame has x to the right and y to the rear", "-y", "-x"),
+}
+OF_LINES: Final = {"yaw rate", "clocks", "y to the right"}  # causes that points of lines tell
+Told = dict[Hint, float]  # hints, and how much more of the motions each explains
 
 
-def telling_pairs(log: Log, pairs: Pairs) -> Pairs:
-    """Return the pairs of cycles that see the same cones by odometry, or adjacent pairs for a bad odometry.
-
-    Pairs of different cones would fit a vehicle at rest best, since one stretch looks like the next.
-    """
-    if beyond_any_vehicle(log.odometry):
-        return pairs.chosen(pairs.gap <= hypotheses.PAIR_GAPS[1])
-    motion = hypotheses.motions(log.odometry.t, AS_WRITTEN.poses(log.odometry), pairs.begin, pairs.end)
-    return pairs.chosen(pairs.overlap(motion) >= PAIR_OVERLAP)
-
-
-def _motion_hints(trials: Trials, *, stay: bool) -> list[Hint]:
-    """Return hints by the motion of detections; only some of them if these do not `stay`, as on a line."""
-    if len(trials.pairs) == 0:
-        return beyond_any_vehicle(trials.log.odometry)
-    best, found = _interpretation(trials)
-    if best.hypothesis.content == "nothing" and not stay:
-        return []  # walls look alike from everywhere along them
-    if best.hypothesis.content == "nothing" or (found and camera(trials.pairs)):
-        return found
-    late, of_clocks = _latency(trials, best)
-    if not stay:
-        return found + of_clocks
-    if best.share < hypotheses.LEAST_EXPLAINED and late is best:
-        return found + (_unexplained_hints(trials, best) if not found else [])
-    mounting = hypotheses.mounting_of(trials, late.hypothesis)
-    found += of_clocks
-    if mounting is not None:
-        found = _rotation_hints(found, late, mounting)
-        found += _offset_hints(mounting) + _covariance_hints(mounting)
-    return found + _label_hints(trials, best)
-
-
-def _interpretation(trials: Trials) -> tuple[Trial, list[Hint]]:
-    best = trials.best()
-    figures = far_better(best, trials.as_written)
-    if figures is None:
-        return trials.as_written, beyond_any_vehicle(trials.log.odometry)
-    in_line = camera(trials.pairs)
-    if in_line:
-        return trials.as_written, in_line
-    return best, _frame_hints(best, trials, figures) + _odometry_hints(best.hypothesis, figures)
-
-
-def _frame_hints(best: Trial, trials: Trials, figures: dict[str, float]) -> list[Hint]:
-    """Return a hint about the frame of the detections, or about the axes of the odometry."""
-    frame = best.hypothesis
-    vx, vy = np.median(trials.log.odometry.twist[:, :2], axis=0)
-    sees_ahead = np.nanmedian(trials.pairs.before[..., 0]) > 0.0
-    if frame.stands == AS_WRITTEN.stands:
-        return []
-    if frame.stands == MIRRORED:
-        of_detections = best.sided >= trials.as_written.sided
-        mistake = "y to the right" if of_detections else "yaw rate to the right"
-    elif abs(vy) > abs(vx) and abs(frame.turn) == 90.0:
-        mistake = "vx and vy swapped"
-    elif vx < 0.0 and sees_ahead and frame.stands == (180.0, False):
-        mistake = "backward"
+def motion_hints(log: Log, scale: float) -> list[Hint]:
+    """Return hints by the regression, the strongest first."""
+    motions, told = motions_of(log), Told()
+    share = 100.0 * len(motions.rate) / max(motions.tried, 1)
+    few = motions.tried >= LEAST_PAIRS and share < UNEXPLAINED[0]
+    unexplained = [hint_of("unexplained", share=share, tried=motions.tried)] if few else []
+    if len(motions.rate) < LEAST_MOTIONS:
+        return beyond_any_vehicle(log, scale) or unexplained
+    regression = Regression(log.odometry, motions)
+    fit, why = regression.best()
+    explained, rest = regression.explained(fit), regression.shares(0.0 * motions.velocity, 0.0 * motions.rate)
+    may_rest = rest.both.mean() > explained.both.mean() - AT_REST
+    lines, of_log = (
+        kind_of(one) not in ("cones", None) for one in (replace(log, odometry=regression.odometry(fit)), log)
+    )
+    at_rest = far_better(rest.both, regression.explained(Fit()).both)
+    if at_rest and may_rest and not (lines or of_log):
+        return [hint_of("map frame", evidence=at_rest.words)]
+    if unexplained and not lines and explained.both.mean() < UNEXPLAINED[1]:
+        return unexplained
+    tell(told, why.get("content"), "pose" if fit.content == "pose" else "fixed frame")
+    when, before, after, jumping = regression.jump(fit)
+    if jump := far_better(jumping, np.maximum(explained.both, rest.both)):
+        tell(told, jump, "clock jumps", seconds=after - before, when=when)
     else:
-        mistake = "frame"
-    side = "with y to the right, and " if frame.mirrored else ""
-    what = FRAME_MEANINGS.get(frame.stands, f"the sensor's frame is {side}turned by {_angle(frame.turn)}")
-    return [hint_of(mistake, what=what, how=_remedy(frame), **figures)]
+        late = why.get("lag") if abs(fit.lag) > LATE_TOLD else None
+        tell(told, late, "late" if fit.lag > 0.0 else "early", seconds=abs(fit.lag))
+        tell_missing(told, regression, fit, scale)
+    if not may_rest and all(hint.cause != "speeds" for hint in told):
+        tell_factors(told, regression, fit)
+        tell_frame(told, regression, fit, log, scale)
+    told = {hint: gain for hint, gain in told.items() if not lines or hint.cause in OF_LINES}
+    return sorted(told, key=lambda hint: -told[hint]) or beyond_any_vehicle(log, scale)
 
 
-def _remedy(frame: Hypothesis) -> str:
-    rows = np.round(frame.frame)
-    if np.allclose(frame.frame, rows, atol=1e-9):
-        x, y = (f"{'-' if row.sum() < 0.0 else ''}{'xy'[np.abs(row).argmax()]}" for row in rows)
-        return f"put {x} into column x and {y} into column y"
-    mirror = "negate column y, then " if frame.mirrored else ""
-    return f"{mirror}turn the detections by {_angle(frame.turn)}"
+def tell(told: Told, better: Better | None, mistake: str, **figures: Any) -> None:
+    if better is not None:
+        told[hint_of(mistake, evidence=better.words, **figures)] = better.gain
 
 
-def _angle(turn: float, decimals: int = 0) -> str:
-    return f"{abs(turn):.{decimals}f} degrees to the {'left' if turn > 0.0 else 'right'}"
+def tell_missing(told: Told, regression: Regression, fit: Fit, scale: float) -> None:
+    """Tell a speed or a yaw rate that the cones show and the odometry has not."""
+    explained, (shown_v, shown_w) = regression.explained(fit), regression.around()
+    seen, (v, w) = regression.shares(shown_v, shown_w), regression.predicted(fit)
+    stated_v, stated_w = regression.stated(fit.content, fit.lag)
+    turn, way = far_better(seen.turn, explained.turn), far_better(seen.way, explained.way)
+    rates = {"stated": float(stated_w.std()), "seen": float(shown_w.std())}
+    speeds = {"stated": scale * np.abs(stated_v).mean(), "seen": scale * np.abs(shown_v).mean()}
+    backward = regression.shares(np.where((v.conj() * shown_v).real < 0.0, -v, v), w)
+    if turn and rates["stated"] < FLAT * rates["seen"]:
+        tell(told, turn, "no yaw rate", **rates)
+    elif way and speeds["stated"] < FLAT * speeds["seen"]:
+        tell(told, way, "no speed", **speeds)
+    elif no_sign := far_better(backward.way, explained.way):
+        tell(told, no_sign, "no sign")
+    elif seen.both.mean() > max(WELL_EXPLAINED, explained.both.mean() / FAR_LESS):
+        tell(told, way or turn, "other drive", which="way" if way else "turns")
 
 
-def _odometry_hints(meaning: Hypothesis, figures: dict[str, float]) -> list[Hint]:
-    """Return hints about an odometry that is not a body twist in SI units."""
-    if (meaning.speed, meaning.rate) == (1e-3, 1e-3):
-        return [hint_of("milliseconds", **figures)]
-    found = [] if meaning.content == "twist" else [hint_of(meaning.content, **figures)]
-    if meaning.speed != 1.0:
-        what = hypotheses.SPEED_UNITS[meaning.speed]
-        found.append(hint_of("unit of speeds", what=what, factor=meaning.speed, **figures))
-    if meaning.rate != 1.0:
-        what = hypotheses.RATE_UNITS[meaning.rate]
-        found.append(hint_of("unit of yaw rate", what=what, factor=meaning.rate, **figures))
-    return found
+def tell_factors(told: Told, regression: Regression, fit: Fit) -> None:
+    """Tell factors of speed and yaw rate that are those of other units."""
+    explained, speed, rate = regression.explained(fit), abs(fit.gain), abs(fit.rate)
+    of_speed = regression.explained(replace(fit, gain=fit.gain / max(speed, TINY)))
+    of_rate = regression.explained(replace(fit, rate=float(np.sign(fit.rate))))
+    speeds, rates = far_better(explained.way, of_speed.way), far_better(explained.turn, of_rate.turn)
+    thousandth = {1e-3: "milliseconds"}
+    if speeds and rates and unit_of(speed, thousandth) == unit_of(rate, thousandth):
+        tell(told, speeds, "milliseconds")
+        return
+    for better, mistake, (unit, size) in (
+        (speeds, "unit of speeds", unit_of(speed, SPEED_UNITS)),
+        (rates, "unit of yaw rate", unit_of(rate, RATE_UNITS)),
+    ):
+        tell(told, better if unit else None, mistake, unit=unit, size=size)
 
 
-def _latency(trials: Trials, best: Trial) -> tuple[Trial, list[Hint]]:
-    late = hypotheses.best_lateness(trials, best)
-    figures, seconds = far_better(late, best), late.hypothesis.late
-    if figures is None:
-        return best, []
-    return late, [hint_of("late", seconds=abs(seconds), way="late" if seconds > 0.0 else "early", **figures)]
+def unit_of(size: float, units: Mapping[float, str]) -> tuple[str, float]:
+    """Return name and size of the unit near a size, or of an unknown unit; without a name near 1."""
+    near = min(units, key=lambda one: abs(np.log(one / max(size, TINY))))
+    if 1.0 / SAME_FACTOR < size / near < SAME_FACTOR:
+        return units[near], near
+    return "" if 1.0 / FACTOR_TOLD < size < FACTOR_TOLD else f"units of {size:.3g}", size
 
 
-def _rotation_hints(found: list[Hint], best: Trial, mounting: Mounting) -> list[Hint]:
-    yaw, sigma = mounting.values[0] / DEGREE, mounting.sigmas[0] / DEGREE
-    frame = best.hypothesis
-    if frame.turn % 90.0 == 0.0 and (abs(yaw) < TURN_TOLD or sigma > TURN_SIGMA):
-        return found
-    side = ", with y to the right" if frame.mirrored else ""
-    turned = hint_of("turned", angle=_angle(frame.turn + yaw, 1), side=side)
-    figures = [one.found for one in found if one.cause == "sensor frame"]
-    others = [one for one in found if one.cause not in ("sensor frame", "y to the right")]
-    return [*others, replace(turned, found=figures[0]) if figures else turned]
+def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log, scale: float) -> None:
+    """Tell whether detections, or else the odometry, have other axes than the vehicle, or another origin."""
+    explained, opposite = regression.explained(fit), regression.explained(replace(fit, rate=abs(fit.rate)))
+    mirror, size = far_better(explained.turn, opposite.turn), max(abs(fit.gain), TINY)
+    turn = float(np.angle(fit.gain, deg=True)) * (1.0 if mirror else -1.0)
+    better = far_better(explained.way, regression.explained(replace(fit, gain=complex(size))).way)
+    clear, sure = explained.both.mean() > WELL_EXPLAINED, Better(0.0, "")
+    small = sure if clear and np.rad2deg(fit.sigmas[0] / size) < TURN_SIGMA else None
+    quarter = (90 * round(turn / 90.0) + 179) % 360 - 179
+    is_quarter = abs((turn - quarter + 180.0) % 360.0 - 180.0) < TURN_TOLD
+    vx, vy = np.median(log.odometry.twist[:, :2], axis=0)
+    of_axes = None
+    if is_quarter and abs(quarter) == 90 and abs(vy) > abs(vx):
+        tell(told, better, "swapped")
+    elif is_quarter and quarter == 180 and not mirror and vx < 0.0 and np.median(_points(log).real) > 0.0:
+        tell(told, better, "backward")
+    elif is_quarter and quarter:
+        of_axes, (what, x, y) = better, FRAMES[quarter, bool(mirror)]
+        tell(told, better, "frame", what=what, x=x, y=y)
+    elif abs(turn) > TURN_TOLD:
+        angle = f"{abs(turn):.1f} degrees to the {'left' if turn > 0.0 else 'right'}"
+        side, of_axes = ", with y to the right" if mirror else "", better or small
+        tell(told, of_axes, "turned", angle=angle, side=side, yaw=np.deg2rad(turn))
+    if mirror and not of_axes:
+        back = np.exp(1j * np.deg2rad(turn))
+        of_detections = sided(log, back, mirrored=True) >= sided(log, np.conj(back))
+        tell(told, mirror, "y to the right" if of_detections else "yaw rate to the right")
+    if clear and abs(fit.lever) > max(LEVER_TOLD, fit.sigmas[1] / LEVER_SIGMA):
+        place = scale * fit.lever * np.conj(fit.gain) / size
+        ahead, left = place.real, -place.imag if mirror else place.imag
+        tell(told, sure, "place", ahead=ahead, left=left, along=f"{ahead:+.2f}", aside=f"{left:+.2f}")
 
 
-def _offset_hints(mounting: Mounting) -> list[Hint]:
-    length, sigma = np.hypot(*mounting.values[1:]), mounting.sigmas[1:].max()
-    if length < ARM_TOLD or sigma > ARM_SIGMA * length:
+def side_hints(log: Log) -> list[Hint]:
+    """Return a hint if the motions that cones on the left and on the right show disagree in time."""
+    lags, (most, least) = [], SIDES
+    for side in (LEFT, RIGHT):
+        cycles = tuple(cycle.where(cycle.labels == side) for cycle in log.cycles)
+        motions = motions_of(replace(log, cycles=cycles), most, MIN_MATCHED, fastest=0.0)
+        if len(motions.rate) < least:
+            return []
+        regression = Regression(log.odometry, motions)
+        lags.append(regression.lag(regression.fit("twist", 0.0)))
+    apart, sigma = lags[0][0] - lags[1][0], hypot(lags[0][1], lags[1][1])
+    if abs(apart) < max(SIDES_TOLD, SIDES_CLEAR * sigma):
         return []
-    ahead, left = mounting.values[1:].tolist()
-    words = {"ahead_or_behind": "ahead" if ahead > 0.0 else "behind"}
-    words["left_or_right"] = "left" if left > 0.0 else "right"
-    lengths = {"ahead": ahead, "left": left, "along": abs(ahead), "aside": abs(left)}
-    return [hint_of("place", **words, **{name: Length(value) for name, value in lengths.items()})]
+    late, early = ("left", "right") if apart > 0.0 else ("right", "left")
+    return [hint_of("sides", late=late, early=early, ms=1e3 * abs(apart))]
 
 
-def _covariance_hints(mounting: Mounting) -> list[Hint]:
-    scatter, claimed = mounting.scatter, mounting.claimed
-    too_large = claimed > CLAIMED_MORE * max(scatter, LEAST_SCATTER)
-    if not too_large and claimed * CLAIMED_LESS >= scatter:
-        return []
-    unit = "mm^2 or cm^2, not in m^2" if too_large else "another unit"
-    return [hint_of("covariances", scatter=Length(scatter), claimed=Length(claimed), unit=unit)]
-
-
-def _label_hints(trials: Trials, best: Trial) -> list[Hint]:
-    labels = np.concatenate([cycle.labels for cycle in trials.log.cycles])
-    present = [label for label in (LEFT, RIGHT) if (labels == label).any()]
-    if len(present) != 1 or (labels == UNKNOWN).any() or abs(best.sided - 0.5) > BOTH_SIDES:
-        return []
-    return [hint_of("one label", label=NAMES[present[0]], share=100.0 * best.sided)]
-
-
-def _unexplained_hints(trials: Trials, best: Trial) -> list[Hint]:
-    pairs = trials.pairs
-    motion, size = trials.motion(best.hypothesis), np.hypot(pairs.before[..., 0], pairs.before[..., 1])
-    near = np.hypot(motion[:, 0], motion[:, 1]) < SAME_CONES * np.nanmedian(size)
-    near &= (np.abs(motion[:, 2]) < SAME_CONES) & (pairs.count >= SAME_CONES_SEEN)
-    share = float(best.explained[near].mean()) if near.sum() >= SAME_CONES_PAIRS else 1.0
-    return [] if share > UNEXPLAINED else camera(pairs) or [hint_of("unexplained", share=100.0 * share)]
-
-
-def camera(pairs: Pairs) -> list[Hint]:
-    """Return a hint if the detections lie on a line, as with the axes of a camera."""
-    spread = np.nanstd(pairs.before.reshape(-1, 2), axis=0)
-    least, most = spread.min(), spread.max()
-    in_line = least < LINE_RATIO * most
-    thin, lengths = "xy"[int(spread.argmin())], {"least": Length(least), "most": Length(most)}
-    return [hint_of("camera", thin=thin, **lengths)] if in_line else []
-
+# --- logs that are refused, and words of labels ----------------------------------------------------------
 
 NO_LABEL_WORDS: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
 # causes of a refusal, by the size of numbers; labels and frames are never the cause
-REFUSABLE: Final = frozenset(
-    {"stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances"}
-)
+REFUSABLE: Final = {"stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances"}
 SHOWN_WORDS: Final = 3  # largest number of foreign labels in a hint
 
 
@@ -378,12 +390,10 @@ def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[H
         log = read_usable_log(folder, limits)
     except InputError as error:
         of_data = error.file.name in (ODOMETRY_FILE, DETECTIONS_FILE)
-        causes = (
-            because([hint for hint in refused_hints(folder) if hint.cause in REFUSABLE]) if of_data else ""
-        )
-        if not causes:
+        found = [hint for hint in refused_hints(folder) if hint.cause in REFUSABLE] if of_data else []
+        if not found:
             raise
-        raise InputError(error.file, f"{error.message}; {causes}", error.row) from error
+        raise InputError(error.file, f"{error.message}; {because(found)}", error.row) from error
     return log, hints(log) + _foreign_label_hints(folder, log)
 
 
@@ -391,16 +401,14 @@ def refused_hints(folder: Path) -> list[Hint]:
     """Return the hints about a refused log; none if it cannot be parsed."""
     try:
         files = ODOMETRY_FILE, DETECTIONS_FILE
-        odometry, table = (read_table(folder / file, logs.COLUMNS[file]) for file in files)
-        twists = Odometry(
-            odometry.numbers("t", LARGEST_READING), odometry.stack(("vx", "vy", "wz"), LARGEST_READING)
-        )
+        rows, table = (read_table(folder / file, logs.COLUMNS[file]) for file in files)
+        twists = rows.numbers("t", LARGEST_READING), rows.stack(("vx", "vy", "wz"), LARGEST_READING)
         stamps, points = table.numbers("t", LARGEST_READING), table.stack(("x", "y"), LARGEST_READING)
         covariances = covariances_of(*table.stack(("xx", "xy", "yy"), LARGEST_READING).T)
     except InputError:
         return []
     cycles = logs.cycles_of(stamps, points, covariances, logs.labels_of(table))
-    return hints(Log(twists, cycles, np.ones(3), odometry_stated=False, detections_stated=False))
+    return hints(Log(Odometry(*twists), cycles, np.ones(3), odometry_stated=False))
 
 
 def _foreign_label_hints(folder: Path, log: Log) -> list[Hint]:

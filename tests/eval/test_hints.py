@@ -8,8 +8,10 @@ import pytest
 from pathspace_graph.eval.hints import (
     AS_SIMULATED,
     CAUSES,
-    GOOD,
+    SIMULATED,
+    backs_up,
     causes_of,
+    good_log,
     hints_table,
     judge,
     judged,
@@ -28,10 +30,17 @@ def test_every_mistake_has_its_causes_by_the_longest_beginning() -> None:
     assert causes_of("speeds in the map frame") == CAUSES["speeds in the map frame"] == ("odometry",)
 
 
-def test_every_good_log_has_known_settings() -> None:
-    for name, good in GOOD.items():
-        changed = leaves(override(SimulationSettings(), good.overrides, name))
-        assert {key: changed[key] for key in good.overrides} == good.overrides, name
+def test_every_kind_of_good_log_has_settings_of_its_own() -> None:
+    for name, changes in SIMULATED.items():
+        changed = leaves(override(SimulationSettings(), changes, name))
+        assert {key: changed[key] for key in changes} == changes, name
+    kinds = [changes for changes in SIMULATED.values() if "draw" not in changes]
+    assert all(kinds.count(kind) == 1 for kind in kinds)
+
+
+def test_each_drawn_car_is_another_one() -> None:
+    first, second = (good_log(0, f"drawn car {number}") for number in (0, 1))
+    assert [len(cycle.labels) for cycle in first.cycles] != [len(cycle.labels) for cycle in second.cycles]
 
 
 def test_a_wrong_cause_does_not_count() -> None:
@@ -42,9 +51,9 @@ def test_a_wrong_cause_does_not_count() -> None:
 
 
 def test_a_good_log_is_judged_and_spoiled_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "pathspace_graph.eval.hints.GOOD", {AS_SIMULATED: GOOD[AS_SIMULATED], "backs up": None}
-    )
+    monkeypatch.setattr("pathspace_graph.eval.hints.SIMULATED", {AS_SIMULATED: {}})
+    monkeypatch.setattr("pathspace_graph.eval.hints.PRESET", {})
+    monkeypatch.setattr("pathspace_graph.eval.hints.EDITED", {"backs up": backs_up})
     (arguments, other) = parts_of((0,), ("y to the right",))
     assert (arguments["mistakes"], other["mistakes"]) == (("y to the right",), ())
     rows = judge(**arguments)

@@ -60,9 +60,12 @@ def test_what_the_prior_expects_is_not_worth_a_line() -> None:
     assert diagnose(state(yaw=0.029, latency=-0.029, bias=0.0059), SETTINGS) == []
 
 
-def test_the_line_says_how_far_off_it_is() -> None:
-    (line,) = diagnose(state(range_bias=0.4), SETTINGS)
-    assert line.endswith("(4.0 sigmas of its prior)")
+@pytest.mark.parametrize(("sigma", "words"), [(0.09, "(certain)"), (0.11, "(uncertain)")])
+def test_the_line_says_whether_it_is_certain(sigma: float, words: str) -> None:
+    """A calibration of four of its own standard deviations is certain, however far its prior is."""
+    known = state(range_bias=0.4)
+    (line,) = diagnose(replace(known, sensor_covariance=sigma**2 * np.eye(5)), SETTINGS)
+    assert line == f"ranges are 0.40 m too long {words}"
 
 
 def test_calibrations_are_counted_in_the_sigmas_of_their_priors() -> None:

@@ -39,7 +39,7 @@ def test_a_good_log_is_read_without_hints(tmp_path: Path) -> None:
         ("all lengths in millimetres", "odometry.csv", "the speeds are in mm/s"),
         ("speeds in mm/s", "odometry.csv", "the speeds are in mm/s"),
         ("yaw rate in degrees per second", "odometry.csv", "the yaw rate is in degrees per second"),
-        ("covariances of zero", "detections.csv", "the covariances are in another unit, or no covariances"),
+        ("covariances of zero", "detections.csv", "the covariances are too small, as in another unit"),
     ],
 )
 def test_a_refusal_names_its_likely_cause_in_one_line(
@@ -94,7 +94,7 @@ def test_a_log_in_memory_with_what_no_file_may_have_is_judged_as_its_files_are(
         assert hints(bad) == refused_hints(folder) == []
 
 
-@pytest.mark.parametrize(("command", "code"), [("online", 0), ("batch", 3)])
+@pytest.mark.parametrize(("command", "code"), [("online", 3), ("batch", 3)])
 def test_a_hint_is_told_and_the_log_is_mapped(
     command: str, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -103,8 +103,9 @@ def test_a_hint_is_told_and_the_log_is_mapped(
     shown = t <= log.cycles[60].t
     short = Log(Odometry(t[shown], twist[shown]), log.cycles[:60], log.odometry_sigma)
     folder, out = written(short, tmp_path / "log"), tmp_path / "map"
-    assert main([command, str(folder), "--out", str(out)]) == code  # nothing lies on a boundary of the batch
+    assert main([command, str(folder), "--out", str(out)]) == code
     lines = capsys.readouterr().err.splitlines()
+    assert "not a map of the drive: the positions are in centimetres, not in metres" in lines
     assert [line for line in lines if line.startswith("hint: ")] == lines[:1]
     assert "the positions are in centimetres" in lines[0]
     (hint,) = json.loads((out / "summary.json").read_text())["hints"]
