@@ -84,7 +84,7 @@ def test_both_starts_come_to_one_optimum() -> None:
 
 def test_a_drive_of_more_than_a_lap_needs_no_online_run() -> None:
     """The optimum is that from odometry, to the bit."""
-    result = BatchMapper(None, bean().odometry_sigma).solve(bean())
+    result = BatchMapper(None, bean().noise).solve(bean())
     assert result.online is None and result.map.closed
     np.testing.assert_array_equal(result.trajectory, solved("odometry").trajectory)
 
@@ -106,13 +106,13 @@ def test_the_batch_begins_online_where_odometry_leads_to_no_loop(
     monkeypatch.setattr(Optimizer, "find", fails_once)
     if why == "the map is objected to":
         monkeypatch.setattr(batch_mapper, "evidence_against", lambda *_: "its boundaries cross")
-    result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log)
+    result = BatchMapper(None, log.noise, FixedLagMapper).solve(log)
     assert result.online is not None
     assert len(searches) == (1 if why == "no cone is met again" else 2)
     monkeypatch.undo()
     online = solved("online")
     if why == "no cone is met again":
-        online = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, "online")
+        online = BatchMapper(None, log.noise, FixedLagMapper).solve(log, "online")
     np.testing.assert_allclose(result.trajectory, online.trajectory, atol=1e-9)
 
 
@@ -126,7 +126,7 @@ def test_an_open_track_has_open_curves() -> None:
     cones, labels = corridor(80.0)
     log = noisy(exact_log(ahead(6.0, 10.0), cones, labels), seed=2)
     for start in ("online", "odometry"):
-        result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, start)  # type: ignore[arg-type]
+        result = BatchMapper(None, log.noise, FixedLagMapper).solve(log, start)  # type: ignore[arg-type]
         assert result.convergence.converged
         assert not result.map.closed
         for boundary in result.map.boundaries.values():
@@ -139,7 +139,7 @@ def test_an_open_track_has_open_curves() -> None:
 @pytest.mark.parametrize("share", [0.3, 0.5])
 def test_a_log_that_stops_in_the_middle_of_a_lap(share: float) -> None:
     log = broken_off(bean(), share)
-    result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, "odometry")
+    result = BatchMapper(None, log.noise, FixedLagMapper).solve(log, "odometry")
     assert result.convergence.converged
     assert not result.map.closed
     assert len(result.map.boundaries) == 2
@@ -150,7 +150,7 @@ def test_a_log_that_stops_in_the_middle_of_a_lap(share: float) -> None:
 def test_several_laps_that_stop_in_the_middle_of_one() -> None:
     """After two laps and a half the map is closed, and the poses of every lap are beside the same curves."""
     log = noisy(lap_log(bean_track(), overrun=160.0), seed=4)
-    result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(log, "odometry")
+    result = BatchMapper(None, log.noise, FixedLagMapper).solve(log, "odometry")
     assert result.convergence.converged
     assert result.map.closed
     assert result.laps == 2
@@ -171,7 +171,7 @@ def test_the_map_of_a_log_without_detections_is_its_odometry() -> None:
             for c in log.cycles
         ),
     )
-    result = BatchMapper(None, log.odometry_sigma, FixedLagMapper).solve(empty, "odometry")
+    result = BatchMapper(None, log.noise, FixedLagMapper).solve(empty, "odometry")
     assert result.convergence.converged
     assert not result.map.boundaries
     np.testing.assert_allclose(result.trajectory, true_poses(log), atol=1e-3)

@@ -149,14 +149,14 @@ Mapped = tuple[FixedLagMapper, list[CycleResult]]
 
 def map_log(log: Log, mapper: FixedLagMapper | None = None, known: Sequence[CycleResult] = ()) -> Mapped:
     """A mapper after the log, which has said what is known of its first cycles already."""
-    mapper = mapper or FixedLagMapper(odometry_sigma=log.odometry_sigma)
+    mapper = mapper or FixedLagMapper(odometry_sigma=log.noise)
     rest = islice(split_odometry(log), len(known), None)
     return mapper, [*known, *(replay(mapper, *cycle) for cycle in rest)]
 
 
 @cache
 def _beginning_of(log: Log, cycles: int, settings: MapperSettings | None) -> Mapped:
-    mapper = FixedLagMapper(settings, log.odometry_sigma)
+    mapper = FixedLagMapper(settings, log.noise)
     return map_log(replace(log, cycles=log.cycles[:cycles]), mapper)
 
 
