@@ -48,7 +48,7 @@ def gnss_factor(key: int, fix: Array) -> gtsam.NonlinearFactor:
 
 def drive(log: Log, fixes: Array | None) -> Array:
     """Map a log with fixes (n, 2) or without; return the estimated position (n, 2) of each cycle."""
-    mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
+    mapper = FixedLagMapper(odometry_sigma=log.noise)
     positions = []
     for cycle, (odometry, detections) in enumerate(split_odometry(log)):
         factors = []

@@ -28,7 +28,7 @@ POSE, CALIBRATION, SENSOR = ord("x"), ord("b"), ord("c")
 def build_mapper(cycles: int = 150, seed: int = 0) -> FixedLagMapper:
     """Map a number of cycles on a generated track."""
     log = simulate(generate_track(np.random.default_rng(seed)), SimulationSettings(laps=1), seed)
-    mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
+    mapper = FixedLagMapper(odometry_sigma=log.noise)
     for odometry, detections in islice(split_odometry(log), cycles):
         mapper.update(odometry, detections)
     return mapper

@@ -65,7 +65,7 @@ def survey_factor(mapper: FixedLagMapper, point: Array) -> gtsam.NonlinearFactor
 
 def drive(log: Log, point: Array | None) -> FixedLagMapper:
     """Map a log with a surveyed point (2,) or without; return the mapper."""
-    mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
+    mapper = FixedLagMapper(odometry_sigma=log.noise)
     added = False
     for odometry, detections in split_odometry(log):
         factor = None if added or point is None else survey_factor(mapper, point)

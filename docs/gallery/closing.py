@@ -15,7 +15,7 @@ from pathspace_graph.spline.planning import speed_profile
 
 track = generate_track(np.random.default_rng(11), TrackGeneratorSettings(lap_length=(130, 160), cones=100))
 log = simulate(track, SimulationSettings(laps=2), seed=0)
-result = run_online(log, FixedLagMapper(odometry_sigma=log.odometry_sigma))
+result = run_online(log, FixedLagMapper(odometry_sigma=log.noise))
 result
 
 # %%

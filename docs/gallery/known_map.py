@@ -27,7 +27,7 @@ log = replace(
     cycles=tuple(cycle for cycle in again.cycles if cycle.t > late + 0.1),
     truth=None,
 )
-mapper = FixedLagMapper.on(known, odometry_sigma=log.odometry_sigma)
+mapper = FixedLagMapper.on(known, odometry_sigma=log.noise)
 result = run_online(log, mapper)
 print(next(record.notice for record in result.cycles if record.notice))
 result.plot()

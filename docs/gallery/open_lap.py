@@ -26,7 +26,7 @@ log.plot()
 # `update` takes the twists since the last cycle and the detections of this one. After 120 cycles:
 
 # %%
-mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
+mapper = FixedLagMapper(odometry_sigma=log.noise)
 for odometry, detections in list(split_odometry(log))[:120]:
     result = mapper.update(odometry, detections)
 print(f"{result.t:.1f} s: {sum(result.sizes)} control points, {result.health.condition}")

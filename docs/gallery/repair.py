@@ -15,7 +15,7 @@ from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate
 track = generate_track(np.random.default_rng(11), TrackGeneratorSettings(lap_length=(130, 160), cones=100))
 faults = Faults(sensor=SensorFaults(blind=20.0, blind_at=0.4))
 log = simulate(track, SimulationSettings(laps=2, faults=faults), seed=0)
-result = run_online(log, FixedLagMapper(odometry_sigma=log.odometry_sigma))
+result = run_online(log, FixedLagMapper(odometry_sigma=log.noise))
 for record in result.cycles:
     if record.notice:
         print(f"{record.t:.1f} s: {record.notice}")

@@ -11,7 +11,7 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
 
 log = simulate(skidpad(), SimulationSettings(), seed=0)
-result = run_online(log, FixedLagMapper(odometry_sigma=log.odometry_sigma))
+result = run_online(log, FixedLagMapper(odometry_sigma=log.noise))
 true = np.column_stack(
     [np.interp(result.trajectory_t, log.truth.pose_t, log.truth.poses[:, k]) for k in range(2)]
 )
