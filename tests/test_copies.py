@@ -94,7 +94,7 @@ def test_a_copy_stays_as_it_is_whatever_the_original_does(make: Any, expected: s
     The original is given back what it was before each cycle, and ends with the bits of one that is not.
     """
     log, copies, met = make(), {}, set[str]()
-    mapper = FixedLagMapper(None, log.odometry_sigma)
+    mapper = FixedLagMapper(None, log.noise)
     for k, cycle in enumerate(split_odometry(log)):
         before = _Before.of(mapper)
         mapper._go_back(before)
@@ -110,7 +110,7 @@ def test_a_copy_stays_as_it_is_whatever_the_original_does(make: Any, expected: s
     for before, known in copies.values():
         assert state_of(before) == known
     first, (before, _) = list(copies.items())[-2]
-    other = FixedLagMapper(None, log.odometry_sigma)
+    other = FixedLagMapper(None, log.noise)
     other._go_back(before)
     for cycle in islice(split_odometry(log), first, None):
         replay(other, *cycle)

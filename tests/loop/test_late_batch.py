@@ -83,7 +83,7 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[Slow]:
 def with_settings(**changes: object) -> FixedLagMapper:
     settings = MapperSettings()
     settings = replace(settings, open_lap=replace(settings.open_lap, **changes))  # type: ignore[arg-type]
-    return FixedLagMapper(settings, log().odometry_sigma)
+    return FixedLagMapper(settings, log().noise)
 
 
 @dataclass(frozen=True)

@@ -311,7 +311,7 @@ def test_the_poses_of_the_lap_are_corrected_as_soon_as_the_loop_closes() -> None
     """The odometry has turned the open map by then; the cycle's own pose was right only at its end."""
     drive = lap_log(bean_track(), overrun=40.0)
     drive = noisy(replace(drive, odometry_sigma=np.array([0.1, 0.1, 0.02])), seed=3)
-    mapper, results = FixedLagMapper(MapperSettings(), drive.odometry_sigma), []
+    mapper, results = FixedLagMapper(MapperSettings(), drive.noise), []
     for cycle in split_odometry(drive):
         results.append(replay(mapper, *cycle))
         if mapper.closed:
@@ -334,7 +334,7 @@ def test_the_smoothed_trajectory_is_the_corrected_poses_by_their_stamps() -> Non
     assert np.isnan(smoothed[len(corrected) :]).all()
     np.testing.assert_array_equal(mapper.smoothed(t[3:5] + 1e-3), corrected[3:5])
     assert np.isnan(FixedLagMapper().smoothed(t)).all()
-    whole = run_online(log(), FixedLagMapper(MapperSettings(), log().odometry_sigma))
+    whole = run_online(log(), FixedLagMapper(MapperSettings(), log().noise))
     assert whole.smoothed is not None
     np.testing.assert_array_equal(whole.smoothed[: len(corrected)], corrected)
     np.testing.assert_array_equal(whole.smoothed[len(corrected) :], whole.trajectory[len(corrected) :])

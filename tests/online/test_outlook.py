@@ -68,7 +68,7 @@ def test_the_confirmed_curve_is_the_same_with_the_stretch_as_without(mapper: Fix
 
 
 def test_asking_for_the_map_changes_no_estimate(log: Log, mapper: FixedLagMapper) -> None:
-    asked = FixedLagMapper(odometry_sigma=log.odometry_sigma)
+    asked = FixedLagMapper(odometry_sigma=log.noise)
     for odometry, cycle in split_odometry(log):
         asked.update(odometry, cycle)
         asked.outline()
@@ -90,7 +90,7 @@ def test_a_detection_that_is_not_repeated_is_taken_back() -> None:
         np.append(cycle.labels, LEFT).astype(np.intp),
     )
     log = replace(log, cycles=(*log.cycles[:at], ghost, *log.cycles[at + 1 :]))
-    mapper, ends = FixedLagMapper(odometry_sigma=log.odometry_sigma), []
+    mapper, ends = FixedLagMapper(odometry_sigma=log.noise), []
     for odometry, detected in split_odometry(log):
         mapper.update(odometry, detected)
         found = outlooks(mapper).get(LEFT)
