@@ -30,7 +30,7 @@ LEAVES = {"errors", "labels", "console", "lengths", "copies"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "baselines"}
 BELOW_MAPPING = {
-    *("factors", "settings", "spline", "io", "graph", "laps", "health", "run", "snapshot"),
+    *("factors", "settings", "spline", "io", "graph", "laps", "health", "run"),
     "scale",
 }
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
@@ -50,7 +50,6 @@ ARROWS: dict[str, set[str]] = {
     "health": set(),
     "run": {"factors", "io", "laps", "health"},
     "scale": {"factors", "settings", "io", "run"},
-    "snapshot": {"factors", "io", "graph"},
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
     "plausibility": {"factors", "settings", "spline", "io", "health", "front_end", "scale"},
@@ -198,7 +197,6 @@ ASSIGNED = {
         "orientation.z",
         "orientation.w",
     },  # of messages, which are filled in
-    "snapshot": {"array.flags.writeable"},  # of numpy
 }
 """Attributes that a module assigns to objects of others: no module may have another one."""
 

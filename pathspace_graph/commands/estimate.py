@@ -24,7 +24,7 @@ from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.health import DEGRADED, LOST, counts
-from pathspace_graph.io.files import check_file_target, check_target
+from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map
 from pathspace_graph.io.moved import moved_run
@@ -75,8 +75,6 @@ def online_command(options: Online) -> Outcome:
         summarized = summarize(result, log, hints)
         summarized |= {} if known is None else known.summary(estimator, differ)
         write_result(options.out, result, summarized, force=options.force)
-    if options.save is not None and isinstance(estimator, FixedLagMapper):
-        estimator.save(options.save)
     if options.plot is not None:
         plotting().plot_command(Plot(map=options.out, out=options.plot, log=None if known else options.log))
     report(result, log)
@@ -85,7 +83,7 @@ def online_command(options: Online) -> Outcome:
     wrong = objections(hints) + ([f"not a map of the drive: {crossed}"] if crossed else [])
     if known is not None and known.found_at(estimator) is None:
         wrong.append(f"the vehicle was not found on {options.on}: this is the map of its own road")
-    files = (options.out, options.save, options.plot, options.save_view)
+    files = (options.out, options.plot, options.save_view)
     return Outcome([file for file in files if file is not None], summarized, wrong)
 
 
@@ -98,19 +96,11 @@ def check_online_options(options: Online) -> None:
     """Raise an error where options contradict each other, before anything is mapped."""
     estimators.check_online(options.estimator)
     check_target(options.out, MAP_FILE, force=options.force)
-    for name in ("save", "resume", "on"):
-        if getattr(options, name) is not None and options.estimator != DEFAULT_ONLINE:
-            raise SettingsError(f"--{name}: expected --estimator {DEFAULT_ONLINE}, found {options.estimator}")
+    if options.on is not None and options.estimator != DEFAULT_ONLINE:
+        raise SettingsError(f"--on: expected --estimator {DEFAULT_ONLINE}, found {options.estimator}")
     for name, is_given in (("start", options.start is not None), ("keep-map", options.keep_map)):
         if is_given and options.on is None:
             raise SettingsError(f"--{name}: expected --on MAP as well, found none")
-    if options.on is not None and options.resume is not None:
-        raise SettingsError("--on: expected no --resume, since a saved mapper has its own map")
-    if options.resume is not None and options.settings != MapperSettings():
-        expected = "expected no settings, since the saved mapper has its own"
-        raise SettingsError(f"--resume: {expected}, found some")
-    if options.save is not None:
-        check_file_target(options.save)
 
 
 def own_parameters(options: Online | Batch) -> Any:
@@ -127,21 +117,13 @@ def own_parameters(options: Online | Batch) -> Any:
 def begin(
     options: Online, known: KnownTrack | None, log: Log, parameters: Any
 ) -> tuple[Log, OnlineEstimator]:
-    """Make an estimator on a known map or on none, or restore one; and what of the log is left for it."""
-    if known is not None:
-        settings = estimators.settings_of(options.settings, log)
-        start = known.start if options.start is None else np.array(options.start)
-        mapper = FixedLagMapper.on(known.map, settings, log.noise, start=start, keep=options.keep_map)
-        return replace(log, truth=None), mapper  # the truth is in another frame
-    if options.resume is None:
+    """Make an estimator on a known map or on none; and the log, without its truth where that is elsewhere."""
+    if known is None:
         return log, estimators.make_online(options.estimator, options.settings, log, parameters)
-    mapper = FixedLagMapper.restore(options.resume)
-    times = mapper.road.smoother.times
-    cycles = tuple(cycle for cycle in log.cycles if not times or cycle.t > times[-1])
-    if not cycles:
-        expected = f"expected cycles after {times[-1]:g} s, where {options.resume} ends"
-        raise InputError(options.log, f"{expected}, found none")
-    return replace(log, cycles=cycles), mapper
+    settings = estimators.settings_of(options.settings, log)
+    start = known.start if options.start is None else np.array(options.start)
+    mapper = FixedLagMapper.on(known.map, settings, log.noise, start=start, keep=options.keep_map)
+    return replace(log, truth=None), mapper  # the truth is in another frame
 
 
 def batch_command(options: Batch) -> Outcome:

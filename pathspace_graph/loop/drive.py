@@ -74,10 +74,6 @@ class Drive(Copyable):
     def rests(self, road: Road) -> bool:
         return road.path.length < self._rests_until
 
-    def resume(self) -> None:
-        """Resume the batch that was running when the snapshot was saved."""
-        self.solver.resume(prepares=self.record.unsolvable is None)
-
     # --- batches -----------------------------------------------------------------------------------------
 
     def begin_batch(self, road: Road, reading: Reading, start: ClosedMap | Revisit) -> None:

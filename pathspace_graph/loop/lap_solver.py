@@ -54,13 +54,6 @@ class LapSolver(Copyable):
             self._prepared = True
             worker.submit(worker.nothing)
 
-    def resume(self, prepares: bool) -> None:
-        """Resend the lap of a snapshot's running batch, or restart the process."""
-        if self._batch is not None:
-            self._batch.send()
-        elif self._prepared and prepares:
-            worker.submit(worker.nothing)
-
     def begin(self, lap: Callable[[int], OpenLap], window: tuple[int, int], t: float) -> None:
         """Send a lap, built for its first kept cycle, at t (s) in the newest cycle of the window.
 

@@ -43,30 +43,21 @@ class LapBatch:
         self.t = t  # stamp of the cycle that sent the lap (s)
         self.due, self.last = due, last  # first and last cycle in which the result may be used
         self.first_kept = lap.first_kept  # first cycle whose pose stays in the window until then
-        self._lap = lap
-        self._future: Future[LapMarginal] | None = None
-        self.send()
-
-    def send(self) -> Future[LapMarginal]:
-        """Submit the lap unless it is submitted already; a snapshot stores the lap alone."""
-        if self._future is None:
-            self._future = submit(solve_lap, self._lap)
-        return self._future
+        self._future: Future[LapMarginal] = submit(solve_lap, lap)
 
     def wait(self) -> None:
         """Wait for the result without limit."""
-        wait([self.send()])
+        wait([self._future])
 
     def give_up(self) -> None:
         """Cancel the lap; if the process already solves it, end the process."""
-        future = self.send()
-        if not future.done() and not future.cancel():
+        if not self._future.done() and not self._future.cancel():
             _end_worker()
 
     def marginal(self, timeout: float) -> LapMarginal | Unsolved | None:
         """Return the solution or the failure; None if there is neither after a `timeout` (s)."""
         try:
-            solved = self.send().result(timeout)
+            solved = self._future.result(timeout)
         except TimeoutError:
             return None
         except SingularSystemError as error:

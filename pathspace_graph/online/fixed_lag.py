@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import ClassVar, Self
 
 import gtsam
@@ -27,7 +26,6 @@ from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
-from pathspace_graph.snapshot import restore, save
 
 from .estimate import MapperEstimate
 
@@ -226,35 +224,6 @@ class FixedLagMapper(MapperEstimate):
         used, closed = road.used_in_newest(), road.closed
         return CycleResult(t, pose, (left, right), used, closed, stages, jump, notice, self.health)
 
-    # --- the snapshot ------------------------------------------------------------------------------------
-
     def noise_used(self) -> RunNoise:
         """Return the noise in use, and the newest measurement."""
         return scaled(self.front_end.noise_used, self.scale)
-
-    def save(self, path: Path | str) -> None:
-        """Write the mapper to one file, from which `restore` continues to the same map.
-
-        An existing file is replaced, and the write is atomic. SettingsError is raised while a
-        factor of your own is in the window.
-        """
-        count = self.road.smoother.user_factors.count
-        if count:
-            raise SettingsError(f"save: expected no factors of your own in the window, found {count}")
-        save(self, path)
-
-    @classmethod
-    def restore(cls, path: Path | str) -> Self:
-        """Return the mapper written by `save`, with its settings; InputError for any other file.
-
-        A batch that was running is solved again.
-        """
-        mapper = restore(path, cls, FixedLagMapper._query)
-        mapper.drive.resume()
-        return mapper
-
-    def _query(self) -> None:
-        self.outline()
-        if self.road.smoother.times:
-            self.vehicle_state()
-            self.map()

@@ -81,10 +81,6 @@ class Online(Checked, Estimation, FolderCommand, group=""):
     """Keep the known map fixed, and only localize."""
     map_sigma: float = 0.15
     """Standard deviation of the cones of a track file, m."""
-    save: Annotated[Path | None, FILE] = None
-    """File to which the mapper is saved at the end, for `--resume`; only `fixed-lag` can be saved."""
-    resume: Path | None = None
-    """File of a saved mapper, which continues with its own settings and with cycles after its newest."""
     plot: Annotated[Path | None, FILE] = None
     """File for a picture of the map (.png, .pdf or .svg)."""
     view: bool = False

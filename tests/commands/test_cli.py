@@ -19,7 +19,7 @@ from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.commands import estimate as commands_estimate
 from pathspace_graph.graph.elimination import Elimination
 from pathspace_graph.io.log import Detections, Log, Odometry, read_log, write_log
-from pathspace_graph.io.map import MAP_FILE, Map, read_map
+from pathspace_graph.io.map import Map, read_map
 from pathspace_graph.io.results import LapBatches, RunResult
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
 from pathspace_graph.spline.crossing import Crossing
@@ -238,27 +238,6 @@ def test_an_estimate_that_cannot_be_computed_is_one_line_and_exit_code_3(
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.endswith("has failed: LinAlgError: SVD did not converge")
     assert not (tmp_path / "map").exists()
-
-
-def test_a_saved_mapper_goes_on_with_the_rest_of_a_log(log_folder: Path, tmp_path: Path) -> None:
-    half, log = (beginning_of(log_folder, tmp_path / f"{cycles}", cycles) for cycles in (20, 45))
-    file, command = tmp_path / "half.snap", ["online", "--out"]
-    assert main([*command, str(tmp_path / "begun"), str(half), "--save", str(file)]) == 0
-    assert main([*command, str(tmp_path / "rest"), str(log), "--resume", str(file)]) == 0
-    assert main([*command, str(tmp_path / "map"), str(log)]) == 0
-    rest, whole = ((tmp_path / name / MAP_FILE).read_bytes() for name in ("rest", "map"))
-    assert rest == whole
-    assert len((tmp_path / "rest" / "cycles.csv").read_text().splitlines()) == 1 + 25
-
-
-def test_a_log_that_does_not_go_on_is_refused(
-    log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log, file = beginning_of(log_folder, tmp_path / "log"), tmp_path / "end.snap"
-    assert main(["online", str(log), "--out", str(tmp_path / "map"), "--save", str(file)]) == 0
-    assert main(["online", str(log), "--out", str(tmp_path / "more"), "--resume", str(file)]) == 2
-    assert "expected cycles after" in capsys.readouterr().err
-    assert not (tmp_path / "more").exists()
 
 
 def test_a_log_without_detections_says_what_it_could_not_map(

@@ -36,9 +36,6 @@ online LOG --out MAP --max-poses 2.7 | --max-poses: unable to convert
 online LOG --out MAP --keep-map=x | --keep-map: unable to convert
 online LOG --out MAP --noise x | Choose from: "measured", "stated"
 online LOG --out MAP --plot map.doc | map.doc: expected a file name that ends
-online LOG --out MAP --save / | expected a file to write, found a folder
-online LOG --out MAP --estimator ckf --save S | --save: expected --estimator
-online LOG --out MAP --resume S --lag 2 | --resume: expected no settings
 online LOG --out MAP --settings --lag 3 | --settings requires an argument
 online LOG --out MAP --settings none.toml | none.toml: expected a file of settings, found none
 online LOG --out MAP --spline.degree 0 | spline.degree: expected a positive number
@@ -47,7 +44,6 @@ online LOG --out MAP --gate.huber nan | gate.huber: expected a positive number o
 online LOG --out MAP --start 0 0 0 | --start: expected --on MAP as well, found none
 online LOG --out MAP --keep-map | --keep-map: expected --on MAP as well, found none
 online LOG --out MAP --on map --estimator ckf | --on: expected --estimator fixed-lag, found ckf
-online LOG --out MAP --on map --resume S | --on: expected no --resume, since a saved mapper has its own map
 online LOG --out MAP --on map --start 1 2 | --start requires 3
 online LOG --out MAP --on map --map-sigma 0 | map_sigma: expected a positive number, found 0
 online LOG --out MAP --on nowhere | nowhere: expected a map's folder, a track file, skidpad or acceleration

@@ -27,7 +27,6 @@ TRACK_LENGTH = 2e3
 """Tracks are at most this long (m) here: one of 30 km takes the time of thousands of short ones."""
 INSTRUMENTED = [
     "tomllib",
-    "pathspace_graph.snapshot",
     *(f"pathspace_graph.{room}" for room in ("io", "sim", "spline", "eval.experiment", "settings")),
 ]
 """Branches of these modules guide the fuzzer."""

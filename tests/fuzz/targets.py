@@ -9,16 +9,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 
 from pathspace_graph.eval.experiment.study import read_study_file
 from pathspace_graph.io.log import read_log
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import read_trajectory
-from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.sim.track_files import read_track
-from pathspace_graph.snapshot import SNAPSHOT
 
 SECTION = re.compile(rb"(?:\A|(?<=\n))=== ([a-z_]+\.[a-z]+)\n")
 
@@ -57,15 +54,6 @@ def read_tracks(folder: Path) -> None:
             read_track(folder / name)
 
 
-def read_snapshots(folder: Path) -> None:
-    """Reads a snapshot as it is, or of a pickle, with the format and the digest that belong to it."""
-    if (folder / "content.pickle").exists():
-        content = (folder / "content.pickle").read_bytes()
-        head = SNAPSHOT.encode(), sha256(content).hexdigest().encode()
-        (folder / "mapper.snap").write_bytes(b"\n".join([*head, content]))
-    FixedLagMapper.restore(folder / "mapper.snap")
-
-
 LOG = {
     "log.toml": 'format = "pathspace-log/1"\n[odometry]\nsigma = [0.1, 0.1, 0.01]\n',
     "odometry.csv": "t,vx,vy,wz\n0.0,5,0,0\n0.1,5,0,0.1\n0.2,5,0,0.1\n",
@@ -80,5 +68,4 @@ TARGETS = {
     "trajectory": Target({"trajectory.tum": ""}, lambda folder: read_trajectory(folder / "trajectory.tum")),
     "track": Target({"track.yaml": "", "track.csv": ""}, read_tracks),
     "study": Target({"study.toml": ""}, lambda folder: read_study_file(folder / "study.toml")),
-    "snapshot": Target({"mapper.snap": "", "content.pickle": ""}, read_snapshots),
 }

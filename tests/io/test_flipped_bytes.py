@@ -20,7 +20,6 @@ from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.log import FILES, read_log, write_log
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import read_trajectory, write_result
-from pathspace_graph.online.fixed_lag import FixedLagMapper
 
 from ..scenes.pretenders import write_round_track
 from .test_log import small_log
@@ -34,7 +33,6 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "map.json": ("map", read_map),
     "trajectory.tum": ("map", lambda folder: read_trajectory(folder / "trajectory.tum")),
     "cycles.csv": ("map", read_cycles),
-    "mapper.snap": ("snapshot", lambda folder: FixedLagMapper.restore(folder / "mapper.snap")),
 }
 
 
@@ -42,7 +40,6 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("written")
     write_log(small_log(), folder / "log")
-    FixedLagMapper(odometry_sigma=small_log().odometry_sigma).save(folder / "snapshot" / "mapper.snap")
     write_result(folder / "map", result(), {"estimator": "fixed-lag", "laps": [{"lap": 1, "rmse": 0.5}]})
     return folder
 
@@ -71,8 +68,7 @@ def refused(file: Path, read: Callable[[Path], object]) -> int:
 @pytest.mark.parametrize("name", READERS)
 def test_in_a_file_of_a_log_or_a_map(name: str, written: Path) -> None:
     folder, read = READERS[name]
-    count = refused(written / folder / name, read)
-    assert count == FLIPS or name != "mapper.snap", "it has a digest"
+    refused(written / folder / name, read)
 
 
 def test_in_a_cell_of_a_study(tmp_path: Path) -> None:

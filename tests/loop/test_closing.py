@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from pathspace_graph.settings.mapper import Knots, MapperSettings, SplineSetting
 from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import relocate
 
+from ..oracles.copied import copied
 from ..scenes.drives import (
     ODOMETRY_SIGMA,
     ahead,
@@ -51,29 +51,27 @@ def run(log: Log) -> tuple[FixedLagMapper, list[CycleResult]]:
 
 
 @pytest.fixture(scope="module")
-def snapshot(log: Log, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The mapper a cycle before its curves are met again, as a file; cones don't count."""
+def open_lap(log: Log) -> FixedLagMapper:
+    """The mapper a cycle before its curves are met again; cones don't count."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pathspace_graph.loop.returns.return_to_beginning", lambda *_: None)
         mapper, results = map_log(log)
         cycle = next(k for k, result in enumerate(results) if result.closed) - mapper.settings.open_lap.cycles
         mapper, results = map_log(replace(log, cycles=log.cycles[:cycle]))
     assert not results[-1].closed
-    file = tmp_path_factory.mktemp("before") / "mapper.snap"
-    mapper.save(file)
-    return file
+    return mapper
 
 
 @pytest.fixture
-def before(snapshot: Path) -> FixedLagMapper:
+def before(open_lap: FixedLagMapper) -> FixedLagMapper:
     """The mapper a cycle before its curves are met again; each test has its own."""
-    return FixedLagMapper.restore(snapshot)
+    return copied(open_lap)
 
 
 @pytest.fixture(scope="module")
-def without_batch(log: Log, snapshot: Path) -> FixedLagMapper:
+def without_batch(log: Log, open_lap: FixedLagMapper) -> FixedLagMapper:
     """The mapper after the cycle in which a registration closed it, as there can be no batch."""
-    mapper = FixedLagMapper.restore(snapshot)
+    mapper = copied(open_lap)
     mapper.drive.record.give_up("no batch")
     cycles = [*split_odometry(log)]
     while not replay(mapper, *cycles[mapper.road.smoother.next_cycle]).closed:

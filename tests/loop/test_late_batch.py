@@ -36,7 +36,7 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.digest import digest
+from ..oracles.copied import copied
 from ..scenes.drives import map_log, mapped, replay, true_poses
 from ..scenes.drives import noisy_lap as log
 from ..scenes.holes import unseen
@@ -90,11 +90,11 @@ def with_settings(**changes: object) -> FixedLagMapper:
 class Stem:
     """The open lap with the settings as they are, from which each test goes on with a mapper of its own."""
 
-    file: Path
+    before: FixedLagMapper
     results: list[CycleResult]
 
     def mapper(self) -> FixedLagMapper:
-        return FixedLagMapper.restore(self.file)
+        return copied(self.before)
 
     def rest(self, log: Log) -> Iterator[tuple[Odometry, Detections]]:
         """The cycles that follow."""
@@ -102,12 +102,10 @@ class Stem:
 
 
 @pytest.fixture(scope="module")
-def stem(tmp_path_factory: pytest.TempPathFactory) -> Stem:
+def stem() -> Stem:
     mapper, results = map_log(replace(log(), cycles=log().cycles[:130]))
     assert not results[-1].closed and mapper.drive.solver._batch is None
-    file = tmp_path_factory.mktemp("stem") / "mapper.snap"
-    mapper.save(file)
-    return Stem(file, results)
+    return Stem(mapper, results)
 
 
 def drive(
@@ -337,33 +335,6 @@ def test_the_process_of_the_batch_ends_with_a_mapper_that_is_killed() -> None:
     run = subprocess.run([sys.executable, "-c", KILLED], stdout=subprocess.PIPE, timeout=60.0, check=False)
     assert run.returncode == -signal.SIGKILL
     assert int(run.stdout) > 0  # it was begun; and its end was waited for, since it has the same output
-
-
-def test_a_late_batch_is_sent_again_by_a_restored_mapper(
-    tmp_path: Path, stem: Stem, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    futures: list[Any] = []
-
-    def submit(work: Work, *arguments: Any) -> Any:
-        futures.append((loky.Future(), arguments))
-        return futures[-1][0]
-
-    monkeypatch.setattr(worker, "submit", submit)
-    mapper, cycles = stem.mapper(), stem.rest(log())
-    for cycle in cycles:
-        mapper.update(*cycle)
-        batch = mapper.drive.solver._batch
-        if batch is not None and mapper.road.smoother.next_cycle == batch.due + 3:
-            break
-    mapper.save(tmp_path / "late.snap")
-    restored = FixedLagMapper.restore(tmp_path / "late.snap")
-    (_, lap), (_, same) = futures[-2:]
-    for future, arguments in ((futures[-2][0], lap), (futures[-1][0], same)):
-        future.set_result(solved(*arguments))
-    for cycle in cycles:
-        assert mapper.update(*cycle).notice == restored.update(*cycle).notice == ""
-    assert mapper.batches().ends == restored.batches().ends == (batch.due + 3,)  # type: ignore[union-attr]
-    assert digest(restored) == digest(mapper)
 
 
 # --- what a batch begins with ----------------------------------------------------------------------------

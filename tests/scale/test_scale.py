@@ -350,21 +350,6 @@ def test_a_mapper_that_is_given_no_scale_takes_scenes_as_they_are() -> None:
     assert found.scale == 1.0
 
 
-def test_a_saved_mapper_keeps_its_scale(tmp_path: Path) -> None:
-    log = scaled(short_drive(), 0.1)
-    log = replace(log, cycles=log.cycles[:30])
-    mapper = FixedLagMapper(MapperSettings(scale=0.1), log.noise)
-    cycles = [*split_odometry(log)]
-    for cycle in cycles[:5]:
-        mapper.update(*cycle)
-    mapper.save(tmp_path / "early.snap")
-    again = FixedLagMapper.restore(tmp_path / "early.snap")
-    assert again.scale == 0.1
-    for cycle in cycles[5:]:
-        np.testing.assert_array_equal(again.update(*cycle).pose, mapper.update(*cycle).pose)
-    assert again.outline().size == mapper.outline().size > 0
-
-
 @pytest.mark.parametrize("kind", [FixedLagMapper, LandmarkFixedLag, CkfMapper])
 def test_a_wrong_shape_is_refused_at_any_scale(kind: Any) -> None:
     estimator = kind(MapperSettings(scale=0.1), ODOMETRY_SIGMA)

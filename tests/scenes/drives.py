@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,6 @@ from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate
 from pathspace_graph.sim.vehicle import VehicleSettings, drive, integrate
 
 from ..oracles.copied import copied
-from ..shared.session import once, pickled, unpickled
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -167,20 +165,8 @@ def map_beginning(log: Log, cycles: int, settings: MapperSettings | None = None)
 
 
 def mapped(log: Log) -> Mapped:
-    """A copy of a mapper after a log, which is mapped once a session, and what it said."""
-    mapper, results = once(lambda: map_log(log), "online", log, write=_save, read=_restore)
-    return copied(mapper), [*results]
-
-
-def _save(run: Mapped, folder: Path) -> None:
-    folder.mkdir()
-    mapper, results = run
-    mapper.save(folder / "mapper.snap")
-    pickled(results, folder / "results")
-
-
-def _restore(folder: Path) -> Mapped:
-    return FixedLagMapper.restore(folder / "mapper.snap"), unpickled(folder / "results")
+    """A copy of a mapper after a log that a scene keeps, and what it said."""
+    return map_beginning(log, len(log.cycles))
 
 
 def replay(mapper: FixedLagMapper, odometry: Odometry, detections: Detections) -> CycleResult:
