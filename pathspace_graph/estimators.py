@@ -12,7 +12,6 @@ from typing import Any, Final
 
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.noise import KnownNoise
-from pathspace_graph.front_end.kind import with_kind
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.overrides import override
 from pathspace_graph.mapping.motion import known_noise
@@ -169,7 +168,7 @@ def make_online(name: str, settings: MapperSettings, log: Log, parameters: Any =
 def settings_of(settings: MapperSettings, log: Log) -> MapperSettings:
     """Return settings with what they leave open and a log tells: the scale, and the kind of the sensor."""
     settings = known_settings(settings)
-    return with_kind(replace(settings, scale=chosen_scale(settings, log)), log)
+    return replace(settings, scale=chosen_scale(settings, log)).with_kind(log.sensor.kind)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> BatchEstimator:

@@ -52,7 +52,7 @@ ARROWS: dict[str, set[str]] = {
     "scale": {"factors", "settings", "io", "run"},
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
-    "plausibility": {"factors", "settings", "spline", "io", "health", "front_end", "scale"},
+    "plausibility": {"factors", "settings", "spline", "io", "health", "run", "front_end", "scale"},
     **dict.fromkeys(sorted(ESTIMATORS), BELOW_ESTIMATORS),
     "loop": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
     "online": BELOW_ESTIMATORS | {"loop"},

@@ -36,7 +36,6 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         "settings": result.settings,
         "scale": result.scale,
         "sensor_kind": result.settings.get("kind") or log.sensor.kind or "cones",
-        "sensor_kind_known": bool(result.settings.get("kind") or log.sensor.kind),
         "versions": versions(),
         "lap_count": result.laps,
         "closed": result.map.closed,

@@ -14,7 +14,6 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.se2 import compose, inverse
 from pathspace_graph.front_end.front_end import JudgedLog, judge_log
-from pathspace_graph.front_end.kind import with_kind
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
@@ -145,7 +144,7 @@ class BatchMapper:
         SettingsError if the start needs an online mapper and there is none, SolveError if the log does not
         determine an optimum.
         """
-        settings = with_kind(self.settings, log)
+        settings = self.settings.with_kind(log.sensor.kind)
         return solved(partial(self._solve, settings, start, on_round), log, settings)
 
     def _solve(
@@ -342,7 +341,7 @@ def _vehicle_of(found: Found, known: FactoredSystem, drive: int) -> VehicleState
 def _map_of_curves(few: Simplified, joint: Array, settings: MapperSettings) -> Map:
     """Return the curves with their cones, and their covariance plus the scatter of the cones."""
     state, boundaries = few.state, {}
-    has_cones = state.closed and not settings.lines
+    has_cones = state.closed and not settings.of_lines
     for label, boundary in state.boundaries.items():
         block = map_block(state, label)
         sigma = np.repeat(few.scatter.of_control_points(label, boundary), 2)

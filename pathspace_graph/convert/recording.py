@@ -194,7 +194,7 @@ def to_log(
         odometry,
         _cycles(record, odometry, frames, noise, file),
         np.array(logs.SIGMA_ODOMETRY if stated is None else stated, dtype=float),
-        sensor=SensorInfo(kind="line" if is_line else None),
+        sensor=SensorInfo(kind="line" if is_line else "cones"),
         source=record.source,
         odometry_stated=stated is not None,
         odometry_drift=None if noise.sigma_drift is None else np.array(noise.sigma_drift),

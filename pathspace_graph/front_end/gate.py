@@ -33,8 +33,6 @@ from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.online import LimitSettings
 
-from .kind import kind_of
-
 TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
 LATEST_STAMP: Final = 1e11  # largest stamp (s), 3000 years: stamps in nanoseconds are larger
 IN_SECONDS: Final = "stamps are in seconds"  # hint for stamps in milli- or nanoseconds
@@ -127,7 +125,7 @@ def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
 
 def check_usable(log: Log, folder: Path, limits: LimitSettings) -> None:
     """Raise an InputError of the log in a folder, with row and stamp, where a cycle is unusable."""
-    gate, newest = Gate(limits, scale_of(log), of_lines=kind_of(log) == "line"), Newest()
+    gate, newest = Gate(limits, scale_of(log), of_lines=log.sensor.kind == "line"), Newest()
     for odometry, detections in split_odometry(log):
         try:
             admitted = gate.admit(odometry, detections, newest)

@@ -76,8 +76,8 @@ class Open(Phase):
     def _is_solvable(self, road: Road, drive: Drive) -> bool:
         """Whether a batch can solve the lap; one with too many cones is given up."""
         cones = sum(  # or equivalent places on a line
-            boundary.length / LINE_STEP if label in self.settings.lines else len(boundary.cone_parameters)
-            for label, boundary in road.boundaries.items()
+            boundary.length / LINE_STEP if self.settings.of_lines else len(boundary.cone_parameters)
+            for boundary in road.boundaries.values()
         )
         if cones > self.settings.open_lap.max_cones:
             drive.record.give_up("the lap has too many cones for a batch")

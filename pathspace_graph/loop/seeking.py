@@ -45,7 +45,7 @@ class Seeking(Phase):
     def __init__(
         self, settings: MapperSettings, track: Map, start: Array | None = None, keep: bool = False
     ) -> None:
-        self.known = known = KnownMap.of(track, keep, settings.lines)
+        self.known = known = KnownMap.of(track, keep, settings.of_lines)
         self.start = start  # (3,) start pose of the drive on the known map, if given
         self.own: Phase = Open(settings)
         self._known = known.smoother(settings)

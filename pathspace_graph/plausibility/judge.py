@@ -15,7 +15,6 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.gate import read_usable_log
-from pathspace_graph.front_end.kind import kind_of
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.covariances import covariances_of
@@ -28,6 +27,7 @@ from pathspace_graph.settings.online import LimitSettings
 
 from .diagnosis import noise_hints
 from .hint import Hint, because, hint_of
+from .kind import is_line
 from .regression import Better, Complex, Fit, Regression, far_better, motions_of
 
 LARGEST_READING: Final = 1e20  # largest number in a log for hints
@@ -54,9 +54,10 @@ def hints(log: Log) -> list[Hint]:
     of_cycles = gaps_and_reach(log)
     log, of_positions = positions_in_metres(log, scale)
     log, of_rows = possible_rows(log)
-    stay = kind_of(log) in ("cones", None)
+    stay = log.sensor.kind != "line" and not is_line(log)
     with threadpool_limits(limits=1):
         found += of_positions + of_rows + (camera(log, scale) or motion_hints(log, scale))
+        found = found or of_kind(log)
         if not found and stay:
             found = one_label(log) + side_hints(log)
     return of_cycles + (found or noise_hints(log, scale, stay=stay))
@@ -238,6 +239,15 @@ FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation 
     (180, True): ("the sensor's frame has x to the rear", "-x", "y"),
     (-90, True): ("the sensor's frame has x to the right and y to the rear", "-y", "-x"),
 }
+
+
+def of_kind(log: Log) -> list[Hint]:
+    """Return a hint if detections are of the other kind than the log says, which is cones by default."""
+    stated = log.sensor.kind or "cones"
+    found = {True: "line", False: "cones", None: stated}[is_line(log)]
+    return [hint_of(f"kind {found}", stated=stated)] if found != stated else []
+
+
 OF_LINES: Final = {"yaw rate", "clocks", "y to the right"}  # causes that points of lines tell
 Told = dict[Hint, float]  # hints, and how much more of the motions each explains
 
@@ -254,8 +264,9 @@ def motion_hints(log: Log, scale: float) -> list[Hint]:
     fit, why = regression.best()
     explained, rest = regression.explained(fit), regression.shares(0.0 * motions.velocity, 0.0 * motions.rate)
     may_rest = rest.both.mean() > explained.both.mean() - AT_REST
+    stated = log.sensor.kind == "line"
     lines, of_log = (
-        kind_of(one) not in ("cones", None) for one in (replace(log, odometry=regression.odometry(fit)), log)
+        stated or bool(is_line(one)) for one in (replace(log, odometry=regression.odometry(fit)), log)
     )
     at_rest = far_better(rest.both, regression.explained(Fit()).both)
     if at_rest and may_rest and not (lines or of_log):

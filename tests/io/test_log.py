@@ -263,7 +263,7 @@ BAD_ROWS = [
         "log.toml",
         'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n[sensor]\nkind = "wall"\n',
         None,
-        "sensor.kind: expected one of cones|line|line-left|line-right",
+        "sensor.kind: expected one of cones|line",
     ),
 ]
 
