@@ -33,8 +33,7 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import known_noise, vehicle_of, with_inflated_priors, with_size
 from pathspace_graph.mapping.orange import OrangeCones, Sighting
 from pathspace_graph.mapping.state import State
-from pathspace_graph.run import Stopwatch, settings_dict
-from pathspace_graph.scale import solved
+from pathspace_graph.run import Stopwatch, settings_dict, solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .gtsam_graph import nonlinear_graph
@@ -145,7 +144,7 @@ class BatchMapper:
         determine an optimum.
         """
         settings = self.settings.with_kind(log.sensor.kind)
-        return solved(partial(self._solve, settings, start, on_round), log, settings)
+        return solved(partial(self._solve, settings, start, on_round), log)
 
     def _solve(
         self,
@@ -153,13 +152,12 @@ class BatchMapper:
         start: Start | None,
         on_round: Callable[[], None] | None,
         log: Log,
-        scale: float,
     ) -> BatchResult:
-        watch, noise = Stopwatch(), known_noise(self.odometry_sigma, scale)
+        watch, noise = Stopwatch(), known_noise(self.odometry_sigma)
         judged = judge_log(log, noise, own_settings(settings))
         watch.lap("integrate")
-        start, given = start or settings.batch.start, replace(settings, scale=scale)
-        begun, online = self._search(log, judged, replace(settings, scale=1.0), noise, start, on_round, watch)
+        start = start or settings.batch.start
+        begun, online = self._search(log, judged, settings, noise, start, on_round, watch)
         found, known = with_wider_priors(begun)
         watch.lap("optimum")
         solved_map = map_of(found, known, _orange(judged, found.at.state), watch)
@@ -167,7 +165,7 @@ class BatchMapper:
             found,
             known,
             solved_map,
-            settings=settings_dict(given),
+            settings=settings_dict(settings),
             noise=judged.noise,
             chain=judged.chain,
             online=online,

@@ -56,17 +56,16 @@ class Reading:
 class FrontEnd(Copyable):
     """Checks of each cycle's readings against the previous cycles, without a map."""
 
-    def __init__(self, settings: MapperSettings, noise: KnownNoise, scale: float = 1.0) -> None:
-        """Start with the noise known at scale 1; lengths of the cycles are divided by `scale`."""
+    def __init__(self, settings: MapperSettings, noise: KnownNoise) -> None:
         self.noise = NoiseLearner(noise, settings.noise, of_lines=settings.of_lines)
-        self.gate = Gate(settings.limits, scale, of_lines=settings.of_lines)
+        self.gate = Gate(settings.limits, of_lines=settings.of_lines)
         self._motion = MotionCheck(self.noise.twist, settings.motion, of_lines=settings.of_lines)
         self._settings = settings
         self._begun = self._sensor_doubted = False
         self._sides = SideJudge(settings.sides)
 
     def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
-        """Return the cycle at scale 1; raise a ReadingError if it is unusable."""
+        """Return a usable cycle; raise a ReadingError for any other."""
         return self.gate.admit(odometry, detections, self._motion.newest)
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
@@ -135,7 +134,7 @@ class JudgedLog:
 
 
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
-    """Check a log at scale 1 for a batch; unknown noise is measured on the whole log first."""
+    """Check a log for a batch; unknown noise is measured on the whole log first."""
     front_end = FrontEnd(settings, noise)
     if front_end.noise.is_learning:
         front_end = FrontEnd(settings, replace(noise, measured=measure_log(log, settings)))

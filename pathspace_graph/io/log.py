@@ -16,7 +16,7 @@ from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, UNKNOWN, Kind, label_from_name
-from pathspace_graph.lengths import POSE_LENGTHS
+from pathspace_graph.lengths import POSE_LENGTHS, scaled
 
 from . import header as headers
 from . import parsing as limits
@@ -173,6 +173,7 @@ class Log:
     LENGTHS: ClassVar = {
         **dict.fromkeys(("odometry", "cycles", "sensor", "measured", "truth"), 0),
         **dict.fromkeys(("odometry_sigma", "odometry_drift"), POSE_LENGTHS),
+        "scale": 1,
     }
 
     odometry: Odometry
@@ -193,6 +194,8 @@ class Log:
     measured: MeasuredNoise | None = None
     """Noise and constant errors of the sensor, as the readings themselves show them."""
     truth: Truth | None = None
+    scale: float = 1.0
+    """Size of the scene by that of a Formula Student track: 0.1 for a model car of 1:10, 3 for a road."""
 
     def __repr__(self) -> str:
         t, noise = self.odometry.t, ("their noise measured", "their noise stated")
@@ -246,11 +249,16 @@ class Log:
             odometry_drift=None if odometry_drift is None else np.array(odometry_drift, float),
         )
 
+    def at_scale_one(self) -> Log:
+        """Divide all lengths by the scale of the scene."""
+        return scaled(self, 1.0 / self.scale)
+
     @property
     def noise(self) -> KnownNoise:
+        """Return the noise as an estimator takes it, divided by the scale of the scene."""
         stated = self.odometry_stated, self.detections_stated
         scale, drift = self.sensor.sigma_range_scale, self.odometry_drift
-        return KnownNoise(self.odometry_sigma, *stated, self.measured, scale, drift)
+        return scaled(KnownNoise(self.odometry_sigma, *stated, self.measured, scale, drift), 1.0 / self.scale)
 
 
 def read_log(folder: Path | str) -> Log:
@@ -272,6 +280,7 @@ def read_log(folder: Path | str) -> Log:
         odometry_drift=None if (drift := header.odometry.drift_sigmas) is None else np.array(drift),
         measured=headers.measured_noise(header, file),
         truth=_read_truth(folder, len(table), headers.true_errors(header, file)),
+        scale=header.scale,
     )
 
 
@@ -294,7 +303,9 @@ def write_log(log: Log, folder: Path | str, *, check: bool = False, force: bool 
     """
     check_type("log", log, Log)
     with atomic_folder(folder, LOG_FILE, force=force) as target:
-        (target / LOG_FILE).write_text(headers.to_toml(_sections(log)), encoding="utf-8", newline="\n")
+        (target / LOG_FILE).write_text(
+            headers.to_toml(_sections(log), log.scale), encoding="utf-8", newline="\n"
+        )
         for name, values in _columns(log).items():
             write_table(target / name, COLUMNS[name], *values)
         if check:

@@ -227,10 +227,6 @@ class MapperSettings(Checked, group=""):
     kind: Kind | None = None
     """What detections are of: cones, which stay where they are, or a line, whose points lie anywhere along
     it. By default it is what the log states, and cones where it states nothing."""
-    scale: float | None = None
-    """Size of the scene by that of a Formula Student track: 0.1 for a model car of 1:10, 3 for a road. All
-    lengths of the settings are those at scale 1. By default the first metres of the log tell it; an online
-    estimator that is made without one takes it as 1."""
     limits: LimitSettings = field(default_factory=LimitSettings)
     spline: SplineSettings = field(default_factory=SplineSettings)
     gauge: GaugeSettings = field(default_factory=GaugeSettings)
