@@ -14,7 +14,6 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.loop.closing import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 from pathspace_graph.mapping import registration
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import DrivenPath
@@ -30,6 +29,7 @@ from .ckf_update import OnCurve, classify, update
 from .landmark_association import ROUGH_GATE, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 from .online import FRONT_END, OnlineBaseline
+from .periodic import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 
 FILTER_REACH: Final = (
     9.0  # largest distance ahead of the vehicle of a curve's end (m along the predicted path)

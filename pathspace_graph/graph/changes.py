@@ -13,12 +13,11 @@ from .gaussian import (
     graph_of,
     marginalize,
     merge_variables,
-    substitute_points,
 )
 from .inactive import InactiveMap
 from .relative import RelativeFactor
 from .smoother import FixedLagSmoother
-from .variables import POINT, pose_keys
+from .variables import pose_keys
 from .window import MapRows
 
 Smoother = FixedLagSmoother[MapRows]
@@ -66,22 +65,6 @@ def solve_revisit(
 
 
 # --- other map points ------------------------------------------------------------------------------------
-
-
-def replace_points(
-    smoother: Smoother, old: IntArray, new: IntArray, points: Array, change: Array, sigma: float
-) -> None:
-    """Replace map points `old` (n,) by `new` (k,) at `points` (k, 2): `c_old = E c_new + N(0, sigma^2)`.
-
-    E is `change` (n, k). The prior of the old points is carried over, reduced by a shift of sigma (m).
-    """
-    variables, user = smoother.variables, smoother.user_factors.remove(old, smoother.variables)
-    reference = variables.reference[variables.layout.entries(old)]
-    offset = np.kron(change, np.eye(POINT)) @ points.ravel() - reference
-    smoother.prior = substitute_points(graph_of(smoother.prior, *user), old, new, change, offset, sigma)
-    variables.remove(old)
-    variables.insert(new, points.ravel())
-    smoother.window.clear()
 
 
 def merge_points(smoother: Smoother, removed: IntArray, kept: IntArray) -> None:

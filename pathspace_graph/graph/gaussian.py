@@ -13,11 +13,10 @@ import numpy as np
 from scipy.linalg import lapack
 
 from pathspace_graph.errors import SingularSystemError
-from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.linear import linear_factor
 
-from .variables import POINT, Layout, Variables, names, sizes
+from .variables import Layout, Variables, names, sizes
 
 GraphPart = (
     gtsam.GaussianFactor | gtsam.GaussianFactorGraph | gtsam.GaussianBayesNet | gtsam.GaussianBayesTree
@@ -246,31 +245,3 @@ def merge_variables(
     information, vector = normal_equations(graph, old)
     root, right = square_root_form(E.T @ information @ E, E.T @ (vector - information @ e))
     return graph_of(gtsam.HessianFactor(graph_of(jacobian_factor(new.keys, root, right))))
-
-
-def substitute_points(
-    graph: gtsam.GaussianFactorGraph, old: IntArray, new: IntArray, change: Array, offset: Array, sigma: float
-) -> gtsam.GaussianFactorGraph:
-    """Return the graph, as one factor, where points `new` (k,) replace points `old` (n,).
-
-    The unknowns satisfy `d_old = (E x I) d_new + offset + N(0, sigma^2)`, with E the matrix `change` (n, k)
-    and `offset` (2 n,). So the information about the old points is reduced by a shift of sigma (m): LAPACK
-    eliminates them from the sum of both.
-    """
-    held, E, weight = Layout(keys_of(graph)), np.kron(change, np.eye(POINT)), sigma**-2
-    information, vector = normal_equations(graph, held)
-    keys = np.concatenate([old, np.setdiff1d(held.keys, old), new])
-    widths, (count, added) = sizes(keys), E.shape
-    known = held.positions(keys) >= 0
-    at, own = kernels.spread((widths.cumsum() - widths)[known], widths[known]), held.entries(keys[known])
-    H, g = np.zeros((widths.sum(), widths.sum())), np.zeros(widths.sum())
-    H[np.ix_(at, at)], g[at] = information[np.ix_(own, own)], vector[own]
-    H[:count, :count] += weight * np.eye(count)
-    H[:count, -added:], H[-added:, -added:] = -weight * E, np.kron(weight * change.T @ change, np.eye(POINT))
-    g[:count] += weight * offset
-    g[-added:] -= weight * offset @ E
-    root = cholesky(np.asfortranarray(H[:count, :count]))
-    half = half_solve(root, np.asfortranarray(np.column_stack([H[:count, count:], g[:count]])))
-    carried, pull = half[:, :-1], half[:, -1]
-    rows = square_root_form(H[count:, count:] - carried.T @ carried, g[count:] - pull @ carried)
-    return graph_of(gtsam.HessianFactor(graph_of(jacobian_factor(keys[len(old) :], *rows))))

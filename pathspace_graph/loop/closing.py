@@ -1,42 +1,24 @@
-"""Loop closing and simplification (paper: Simplification), and the marginal and gauge of the closed map.
+"""What replaces the map of an open road: the marginal of the lap's batch, or a known map; and its gauge."""
 
-The loop closes by a batch of the lap (`swap_in`). A known map replaces an open road in a similar way
-(`lay_on_known`).
-
-Without a batch, `mapping.registration.register` finds correspondences between the newest detections and the
-beginning of the curves. `apply_correspondences` moves the window there and associates the detections with the
-oldest control points, `graph.changes:solve_loop` optimizes the whole loop, and `simplify` makes the curves
-periodic.
-"""
-
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy.linalg import block_diag
 
-from pathspace_graph.batch.association import LINE_STEP, POSE_STEP, headings, locate_poses
+from pathspace_graph.batch.association import POSE_STEP, headings, locate_poses
 from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, left_of, relative, rotation
-from pathspace_graph.graph.changes import hold_motion, replace_points, restart, set_prior
+from pathspace_graph.graph.changes import hold_motion, restart, set_prior
 from pathspace_graph.graph.variables import control_keys, pose_keys
-from pathspace_graph.mapping.registration import BEGINNING, Motion, RefinedMotion
+from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.mapper import Knots, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import curvature_weighted_breaks, refit, thin
 
-EXTRAPOLATED: Final = 2  # knot intervals past the confirmed end that map to the closed curve
-JOIN_MARGIN: Final = 10.0  # with `BEGINNING`, largest distance of the seam from the end of a curve (m)
-JOIN_SHARE: Final = 0.5  # least parameter of the seam on a short curve, as a share of its length
-OVERLAP_STEP: Final = 1.0  # step of the points of the overlap (m)
-OVERLAP_ROOM: Final = 4.0  # search range of their foot points on the beginning, about the expected ones (m)
-SEAM_MARGIN: Final = 0.5  # distance before the seam within which a cone belongs to the beginning (m)
 SIGMAS_CALIBRATIONS: Final = (0.05, 0.02, 0.03, 0.1, 0.05, 0.05, 0.2)
 """Prior standard deviations of the calibrations on a known map, where all are observable: odometry's scale
 (-) and yaw-rate bias (rad/s), and the sensor's yaw (rad), offset (m), latency (s), range scale (-) and bias
@@ -44,130 +26,6 @@ SIGMAS_CALIBRATIONS: Final = (0.05, 0.02, 0.03, 0.1, 0.05, 0.05, 0.2)
 FIRST_ROOM: Final = 2.0  # largest distance of the first place beside a pose over that of the nearest (m)
 FIRST_REACH: Final = 20.0  # search range of foot points about that place (m along the curve)
 SIGMA_STEP: Final = 10.0  # damping of control points while the loop is optimized (m)
-
-
-def apply_correspondences(smoother: CurveSmoother, registration: RefinedMotion) -> None:
-    """Move the window to the beginning of the curves, and associate the inliers with it."""
-    smoother.reactivate(with_prior=smoother.submaps is None)
-    state = smoother.map.state
-    registration.motion.move(state.poses)
-    for label in state.boundaries:
-        rows, u = registration.matches.inliers(label)
-        smoother.map.detections.take(rows, label, u)
-
-
-# --- from an open curve, whose end overlaps its beginning, to a periodic one ------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Overlap:
-    """The correspondence between a curve's end and its beginning."""
-
-    period: float  # length of the closed curve in the open curve's parameter (m)
-    u: Array  # (k,) increasing parameters of the open curve's end, from the seam on
-    w: Array  # (k,) parameters of the corresponding points on the beginning, from 0 on
-
-    def new_parameter(self, u: Array) -> Array:
-        """Map parameters of the open curve to those of the closed one, without wrapping."""
-        return np.where(u < self.u[0], u, self.period + np.interp(u, self.u, self.w))
-
-
-@dataclass(frozen=True, eq=False)
-class PeriodicCurve:
-    """The periodic curve that replaces an open one."""
-
-    overlap: Overlap
-    knots: Array  # (m + 2 p + 1,) periodic knots
-    points: Array  # (m, 2) control points in m, map frame
-    old_from_new: Array  # (n, m) matrix E of the change of variables: `C_old = E C_new`
-
-
-def make_periodic(
-    boundary: Boundary,
-    control_points: Array,
-    settings: MapperSettings,
-    knots: Knots,
-) -> PeriodicCurve:
-    """Fit a periodic curve to an open one with control points (n, 2).
-
-    The number of its control points is a share of the number of cones, or of equivalent places on a line.
-    """
-    spline, overlap = boundary.spline(control_points), find_overlap(boundary, control_points)
-    period, u = overlap.period, boundary.cone_parameters
-    u = np.arange(0.0, period, LINE_STEP) if settings.of_lines else u
-    u = _apart(u[u < period - SEAM_MARGIN], settings.growth.merge_radius)
-    size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
-    if knots == "curvature" or size >= len(u):
-        breaks = curvature_weighted_breaks(spline, size, settings.spline.linear_baseline, 0.0, period)
-    else:
-        cones = boundary.evaluate(control_points, u)
-        *_, thinned = thin(cones, u, period, True, boundary.degree, size)
-        breaks = thinned.breaks
-    frame = BSpline.periodic_from(breaks, np.zeros((len(breaks) - 1, 2)), boundary.degree)
-    change = refit(spline, frame, overlap.new_parameter)
-    return PeriodicCurve(overlap, frame.knots, change.new_from_old @ control_points, change.old_from_new)
-
-
-def _apart(values: Array, distance: float) -> Array:
-    """Thin sorted values (k,) so that successive ones differ by more than `distance`."""
-    kept: list[float] = []
-    for value in values.tolist():
-        if not kept or value - kept[-1] > distance:
-            kept.append(value)
-    return np.array(kept)
-
-
-def find_overlap(boundary: Boundary, control_points: Array) -> Overlap:
-    """Find the overlap of a curve's end with its beginning; the seam is the foot point of the beginning.
-
-    A gap between end and beginning is bridged by a straight line.
-    """
-    confirmed_end = boundary.confirmed_end
-    late = max(confirmed_end - BEGINNING - JOIN_MARGIN, JOIN_SHARE * confirmed_end)
-    ends = boundary.evaluate(control_points, np.array([0.0, confirmed_end]))
-    foot = boundary.find(control_points, ends[:1], np.array([late]), np.array([confirmed_end]))
-    if not foot.interior[0]:
-        period = confirmed_end + float(np.hypot(*(ends[0] - ends[1])))
-        return Overlap(period, np.array([period, period + 1.0]), np.array([0.0, 1.0]))
-    seam = float(foot.u[0])
-    u = np.linspace(seam, confirmed_end, max(int((confirmed_end - seam) / OVERLAP_STEP), 1) + 1)
-    low, high = np.maximum(u - seam - OVERLAP_ROOM, 0.0), u - seam + OVERLAP_ROOM
-    w = boundary.find(control_points, boundary.evaluate(control_points, u), low, high).u
-    w = np.maximum.accumulate(w)
-    w[0], beyond = 0.0, EXTRAPOLATED * boundary.nominal[0]
-    return Overlap(seam, np.append(u, u[-1] + beyond), np.append(w, w[-1] + beyond))
-
-
-def simplify(smoother: CurveSmoother) -> None:
-    """Replace every open curve by a periodic one of its final size, and step to the new optimum."""
-    state, settings = smoother.map.state, smoother.map.settings
-    knots = settings.spline.knots
-    periodic = {
-        label: make_periodic(boundary, state.control_points(label), settings, knots)
-        for label, boundary in state.boundaries.items()
-    }
-    substitute(smoother, periodic)
-    for _ in range(settings.closing.iterations):
-        smoother.step(SIGMA_STEP)
-
-
-def substitute(smoother: CurveSmoother, periodic: dict[int, PeriodicCurve]) -> None:
-    """Change variables by `C_old = E C_new` in graph, detections and parameters of the poses."""
-    state, detections = smoother.map.state, smoother.map.detections
-    closed = {label: state.boundaries[label].closed(new.knots) for label, new in periodic.items()}
-    replace_points(
-        smoother,
-        np.concatenate([state.keys(label) for label in periodic]),
-        np.concatenate([control_keys(label, boundary.numbers) for label, boundary in closed.items()]),
-        np.concatenate([new.points for new in periodic.values()]),
-        block_diag(*(new.old_from_new for new in periodic.values())),
-        smoother.map.settings.spline.sigma_simplify,
-    )
-    for label, new in periodic.items():
-        rows = detections.used_on(label)
-        state.close(label, closed[label])
-        detections.take(rows, label, new.overlap.new_parameter(detections.u[rows]))
-        state.locate(label, new.overlap.new_parameter(state.pose_u[label]))
 
 
 # --- the marginal of the open lap's batch ----------------------------------------------------------------

@@ -5,22 +5,18 @@ from typing import ClassVar, Final
 
 from pathspace_graph.batch.association import LINE_STEP
 from pathspace_graph.front_end.front_end import Reading
-from pathspace_graph.graph.changes import solve_loop
 from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.mapping.registration import RefinedMotion
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .closed import Closed
-from .closing import SIGMA_STEP, apply_correspondences, simplify
 from .drive import Drive, Phase, Step
 from .lap_solver import Outcome
 from .returns import ReturnFinder
 from .revisit import Revisits
 from .worker import Unsolved
 
-OWN_PRIOR: Final = "the map goes on from the window's own prior"  # beginning of the notice without a batch
-STAYS_OPEN: Final = "the loop stays open"  # beginning of the notice of a rejected batch
+STAYS_OPEN: Final = "the loop stays open"  # beginning of the notice without a batch that agrees
 REVISITED: Final = "the road was driven before: the open map was optimized with the earlier pass"
 """Notice of the first cycle with a revisit."""
 
@@ -32,9 +28,10 @@ class Open(Phase):
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
-        self.returns = ReturnFinder(settings.closing)
+        self.returns = ReturnFinder(settings)
         self.revisits = Revisits(settings)
         self.returned_by: Revisit | None = None  # relative pose that started the newest batch
+        self._said = False  # whether a notice has said why there is no batch
 
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
         """Search for a return, which starts a batch; apply the batch's result, or a revisit."""
@@ -46,8 +43,7 @@ class Open(Phase):
     def _step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
         if not drive.solver.is_busy:
             if not self._is_solvable(road, drive):
-                found = self.returns.by_curves(road)
-                return Step(self) if found is None else self._close_by_prior(road, drive, found)
+                return self._stay_open(drive)
             self._begin_batch(road, drive, reading)
         if drive.solver.is_busy:
             outcome = drive.outcome(road, spent)
@@ -59,7 +55,7 @@ class Open(Phase):
         return Step(self, drive.lay_on(road, revisit), notice)
 
     def _begin_batch(self, road: Road, drive: Drive, reading: Reading) -> None:
-        """Start a batch of the lap if the newest detections, cones or curves match earlier ones.
+        """Start a batch of the lap if the newest detections match those of its beginning.
 
         The map stays open until the batch confirms the match.
         """
@@ -82,28 +78,19 @@ class Open(Phase):
             drive.record.give_up("the lap has too many cones for a batch")
         return drive.record.unsolvable is None
 
+    def _stay_open(self, drive: Drive) -> Step:
+        """Continue without a batch; the first notice says why."""
+        said, self._said = self._said, True
+        return Step(self, notice="" if said else f"{STAYS_OPEN}: {drive.record.unsolvable}")
+
     # --- closing -----------------------------------------------------------------------------------------
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
         """Close the loop by a batch that confirms it; otherwise the notice says why it stays open."""
         if isinstance(outcome, Unsolved):
-            if outcome.is_final:
-                drive.record.give_up(outcome.reason)
-                self.returns.rest(road, 0.0)  # a registration may close the loop at once
             return Step(self, notice=f"{STAYS_OPEN}: {outcome.reason}")
         if outcome.objection:
             return Step(self, notice=f"{STAYS_OPEN}: {outcome.objection}")
         road.smoother.settle()
         jump = drive.close(road, outcome, self.returned_by)
         return Step(self.CLOSED(road, drive), jump)
-
-    def _close_by_prior(self, road: Road, drive: Drive, found: RefinedMotion) -> Step:
-        """Close the loop by the window's own prior, as no batch is possible."""
-        smoother = road.smoother
-        apply_correspondences(smoother, found)
-        keyframes = solve_loop(smoother, self.settings.closing.iterations, SIGMA_STEP)
-        drive.record.bent(keyframes, road)
-        simplify(smoother)
-        smoother.settle()
-        drive.record.replaced(drive.record.with_window(road))
-        return Step(self.CLOSED(road, drive), notice=f"{OWN_PRIOR}: {drive.record.unsolvable}")

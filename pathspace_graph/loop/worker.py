@@ -30,7 +30,6 @@ class Unsolved:
     """Failure of a batch."""
 
     reason: str
-    is_final: bool = True  # whether a later attempt would fail as well
 
 
 BATCH_LATE: Final = Unsolved("the batch of the lap was late")
@@ -61,14 +60,14 @@ class LapBatch:
         except TimeoutError:
             return None
         except SingularSystemError as error:
-            return Unsolved(str(error), is_final=False)
+            return Unsolved(str(error))
         except BrokenProcessPool:
             return Unsolved("the process of the batch has died")
         except Exception as error:  # the vehicle drives on, whatever fails
             failed = f"the batch of the lap has failed: {type(error).__name__}: {error}"
             return Unsolved(" ".join(failed.split()))
         nearly = solved.convergence.converged or solved.convergence.gradient < SOLVED
-        return solved if nearly else Unsolved("the batch of the lap has not converged", is_final=False)
+        return solved if nearly else Unsolved("the batch of the lap has not converged")
 
 
 def submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:

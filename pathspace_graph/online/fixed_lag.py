@@ -68,8 +68,6 @@ class FixedLagMapper(MapperEstimate):
         self.phase: Phase = self.FIRST_PHASE(self.settings)
         self.health = Health()  # health of the newest estimate
         self._unused: Odometry | None = None  # twists of a skipped cycle
-        if self.settings.open_lap.prior == "window":
-            self.drive.record.give_up("no batch of the lap was asked for")
 
     @classmethod
     def on(

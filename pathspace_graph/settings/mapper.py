@@ -147,8 +147,6 @@ class ClosureSettings(Checked, group="batch.closure"):
 class OpenLapSettings(Checked, group="open_lap"):
     """Batch over the open lap, which closes the loop online."""
 
-    prior: Literal["batch", "window"] = "batch"
-    """Prior after closing: a batch over the open lap, or with `window` what the window has marginalized."""
     cycles: int = 20
     """Cycles after the return at which the batch closes the loop, or as many as the window holds."""
     cycles_share: float = 0.03
@@ -160,7 +158,7 @@ class OpenLapSettings(Checked, group="open_lap"):
     retry: float = 20.0
     """Least length of path from one batch of the lap to the next, where it does not agree (m)."""
     max_cycles: Unlimited = 6000.0
-    """Most cycles of an open lap that is solved as a batch; a longer one is left to the window."""
+    """Most cycles of an open lap that is solved as a batch; a longer one stays open."""
     max_cones: Unlimited = 1500.0
     """Most cones of a lap that is solved as a batch, since with more it would not be in time."""
 

@@ -9,7 +9,7 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose
-from pathspace_graph.graph.changes import merge_points, replace_points, solve_loop
+from pathspace_graph.graph.changes import merge_points, solve_loop
 from pathspace_graph.graph.gaussian import factorize, graph_of, keys_of, normal_equations
 from pathspace_graph.graph.rows import Rows, calibrated_delta
 from pathspace_graph.graph.smoother import FixedLagSmoother
@@ -280,35 +280,6 @@ def test_removing_information_on_a_point_keeps_the_window_and_all_other_points()
     mean = (joint @ vector)[stay]
     np.testing.assert_allclose(found_vector, expected @ mean, atol=1e-4 * np.abs(found_vector).max())
     assert np.isfinite(smoother.covariance(gone)).all()
-
-
-def test_substituted_points_know_what_the_old_ones_did() -> None:
-    """Three points are, up to a shift, a matrix times two new ones: as in a dense change of variables."""
-    drive = LinearDrive(2)
-    drive.drive(14)
-    smoother, rng, sigma = drive.smoother, np.random.default_rng(0), 0.2
-    old, new = control_keys(0, np.arange(3)), control_keys(1, np.arange(2))
-    layout = Layout(keys_of(smoother.prior))
-    information, vector = normal_equations(smoother.prior, layout)
-    reference = smoother.variables.reference[smoother.variables.layout.entries(layout.keys)].copy()
-    change, points = rng.normal(size=(3, 2)), rng.normal(size=(2, 2))
-    replace_points(smoother, old, new, points, change, sigma)
-    rest = np.setdiff1d(layout.keys, old)
-    found_layout = Layout(np.sort(np.append(rest, new)))
-    matrix = np.zeros((layout.size, found_layout.size))
-    matrix[layout.entries(rest), found_layout.entries(rest)] = 1.0
-    matrix[np.ix_(layout.entries(old), found_layout.entries(new))] = np.kron(change, np.eye(2))
-    shift = np.zeros(layout.size)
-    shift[layout.entries(old)] = sigma**2
-    raised = information @ np.linalg.inv(np.eye(layout.size) + shift[:, None] * information)
-    lowered = np.linalg.solve(np.eye(layout.size) + information * shift, vector)
-    moved = smoother.variables.reference[smoother.variables.layout.entries(found_layout.keys)]
-    lowered = lowered - raised @ (matrix @ moved - reference)
-    found, found_vector = normal_equations(smoother.prior, found_layout)
-    np.testing.assert_allclose(found, matrix.T @ raised @ matrix, atol=1e-9 * np.abs(found).max())
-    np.testing.assert_allclose(found_vector, matrix.T @ lowered, atol=1e-9 * np.abs(found_vector).max())
-    assert not np.isin(old, smoother.variables.keys).any()
-    np.testing.assert_array_equal(smoother.variables.of(new), points.ravel())
 
 
 # --- relinearization in the mapper -----------------------------------------------------------------------

@@ -8,17 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.baselines.periodic import make_periodic
 from pathspace_graph.eval.metrics.accuracy import cone_distances
-from pathspace_graph.graph.gaussian import keys_of, normal_equations
-from pathspace_graph.graph.variables import Layout, control_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
-from pathspace_graph.loop.closing import PeriodicCurve, make_periodic, substitute
 from pathspace_graph.mapping.registration import RefinedMotion, near_start, register
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.mapper import Knots, MapperSettings, SplineSettings
+from pathspace_graph.settings.mapper import Knots, MapperSettings
 from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import relocate
 
@@ -32,7 +30,6 @@ from ..scenes.drives import (
     exact_log,
     map_log,
     mapped,
-    replay,
     true_poses,
 )
 
@@ -52,11 +49,10 @@ def run(log: Log) -> tuple[FixedLagMapper, list[CycleResult]]:
 
 @pytest.fixture(scope="module")
 def open_lap(log: Log) -> FixedLagMapper:
-    """The mapper a cycle before its curves are met again; cones don't count."""
+    """The mapper some metres after its curves are met again, which it does not notice."""
+    cycle = next(k for k, result in enumerate(mapped(log)[1]) if result.closed)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pathspace_graph.loop.returns.return_to_beginning", lambda *_: None)
-        mapper, results = map_log(log)
-        cycle = next(k for k, result in enumerate(results) if result.closed) - mapper.settings.open_lap.cycles
         mapper, results = map_log(replace(log, cycles=log.cycles[:cycle]))
     assert not results[-1].closed
     return mapper
@@ -66,17 +62,6 @@ def open_lap(log: Log) -> FixedLagMapper:
 def before(open_lap: FixedLagMapper) -> FixedLagMapper:
     """The mapper a cycle before its curves are met again; each test has its own."""
     return copied(open_lap)
-
-
-@pytest.fixture(scope="module")
-def without_batch(log: Log, open_lap: FixedLagMapper) -> FixedLagMapper:
-    """The mapper after the cycle in which a registration closed it, as there can be no batch."""
-    mapper = copied(open_lap)
-    mapper.drive.record.give_up("no batch")
-    cycles = [*split_odometry(log)]
-    while not replay(mapper, *cycles[mapper.road.smoother.next_cycle]).closed:
-        pass
-    return mapper
 
 
 def test_the_loop_closes_once_the_beginning_is_driven_again(
@@ -118,11 +103,8 @@ def test_a_closed_curve_has_no_seam(run: tuple[FixedLagMapper, list[CycleResult]
             np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
 
 
-@pytest.mark.parametrize("when", ["without_batch", "run"])
-def test_the_closed_curves_pass_the_cones(log: Log, when: str, request: pytest.FixtureRequest) -> None:
-    """Right after a registration, and some metres after a batch."""
-    mapper = request.getfixturevalue(when)
-    mapper = mapper[0] if isinstance(mapper, tuple) else mapper
+def test_the_closed_curves_pass_the_cones(log: Log, run: tuple[FixedLagMapper, list[CycleResult]]) -> None:
+    mapper = run[0]
     assert log.truth is not None
     distances = cone_distances(mapper.map(), log.truth)
     assert np.sqrt(np.mean(distances**2)) < 0.15
@@ -137,10 +119,8 @@ def test_closing_leaves_the_pose_where_it_is(log: Log, run: tuple[FixedLagMapper
     assert np.abs(error[:, 2]).max() < 0.03
 
 
-@pytest.mark.parametrize("when", ["without_batch", "run"])
-def test_readings_in_use_lie_on_the_closed_curve(when: str, request: pytest.FixtureRequest) -> None:
-    mapper = request.getfixturevalue(when)
-    mapper = mapper[0] if isinstance(mapper, tuple) else mapper
+def test_readings_in_use_lie_on_the_closed_curve(run: tuple[FixedLagMapper, list[CycleResult]]) -> None:
+    mapper = run[0]
     detections = mapper.road.smoother.map.detections
     for label, boundary in mapper.boundaries.items():
         rows = detections.used_on(label)
@@ -218,62 +198,6 @@ def test_knots_by_the_cones_are_nearer_to_them_than_knots_by_curvature(before: F
         cones = boundary.evaluate(points, u)
         off = [np.hypot(*(boundary.closed(new.knots).evaluate(new.points, u) - cones).T) for new in periodic]
         assert np.sqrt(np.mean(off[0] ** 2)) < 0.8 * np.sqrt(np.mean(off[1] ** 2))
-
-
-def prior_system(mapper: FixedLagMapper) -> tuple[Layout, Array, Array]:
-    """`1/2 d' L d - g' d` of the prior, d = value - reference."""
-    layout = Layout(keys_of(mapper.road.smoother.prior))
-    return layout, *normal_equations(mapper.road.smoother.prior, layout)
-
-
-def change_of_variables(
-    mapper: FixedLagMapper, periodic: dict[int, PeriodicCurve], old: Layout, new: Layout
-) -> tuple[Array, Array]:
-    """`x_old = T x_new`, where what the curves don't hold stays as it is; and which entries are a curve's."""
-    matrix, curves = np.zeros((old.size, new.size)), np.zeros(old.size, bool)
-    others = np.intersect1d(old.keys, new.keys)
-    matrix[old.entries(others), new.entries(others)] = 1.0
-    for label, change in periodic.items():
-        last = mapper.boundaries[label].first
-        keys = control_keys(label, np.arange(last - len(change.old_from_new), last))
-        held = old.positions(keys) >= 0
-        by_point = np.kron(change.old_from_new[held], np.eye(2))
-        onto = new.entries(np.array(mapper.control_keys(label)))
-        rows = old.entries(keys[held])
-        matrix[np.ix_(rows, onto)], curves[rows] = by_point, True
-    return matrix, curves
-
-
-@pytest.mark.parametrize("sigma", [1e-5, 0.05])
-def test_the_change_of_variables_is_exact(
-    before: FixedLagMapper, sigma: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """`C_old = E C_new + N(0, sigma^2)`: the prior of the old curves, shifted by so much, on the new ones.
-
-    With S the covariance of the shift: `L (1 + S L)^-1` and `(1 + L S)^-1 g`, also where L is singular.
-    """
-    smoother = before.road.smoother
-    smoother.reactivate()
-    monkeypatch.setattr(SplineSettings, "sigma_simplify", sigma)
-    settings = before.settings
-    state = smoother.map.state
-    old, information, gradient = prior_system(before)
-    known = smoother.variables.reference[smoother.variables.layout.entries(old.keys)].copy()
-    periodic = {
-        b: make_periodic(one, state.control_points(b), settings, "cones")
-        for b, one in state.boundaries.items()
-    }
-    substitute(smoother, periodic)
-    new, found, found_gradient = prior_system(before)
-    matrix, curves = change_of_variables(before, periodic, old, new)
-    shift = np.diag(sigma**2 * curves)
-    expected = information @ np.linalg.inv(np.eye(old.size) + shift @ information)
-    gradient = np.linalg.solve(np.eye(old.size) + information @ shift, gradient)
-    away = matrix @ smoother.variables.reference[smoother.variables.layout.entries(new.keys)] - known
-    negative_gradient = matrix.T @ (gradient - expected @ away)
-    expected = matrix.T @ expected @ matrix
-    np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
-    np.testing.assert_allclose(found_gradient, negative_gradient, atol=1e-7 * np.abs(expected).max())
 
 
 # --- where it mustn't ------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ from pathspace_graph.mapping.registration import Matches, Motion, RefinedMotion
 from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.mapper import MapperSettings, OpenLapSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from ..oracles.copied import copied
 from ..scenes.drives import ODOMETRY_SIGMA, Mapped, detections, map_beginning, map_log, replay, true_poses
@@ -43,10 +43,6 @@ NOTHING = Gating(np.zeros(0, np.intp), np.zeros(0, bool), np.zeros(0))
 """No detection was tested."""
 
 
-SETTINGS = MapperSettings(open_lap=OpenLapSettings(prior="window"))
-"""The mapper goes on from the window's own prior when its loop closes."""
-
-
 @cache
 def three_laps() -> Log:
     return laps_log(pear_track())
@@ -55,13 +51,13 @@ def three_laps() -> Log:
 def put_down_on(distance: float) -> tuple[Log, Mapped]:
     """Returns the log of a vehicle that is put down farther on (m), and a mapper as it was until then."""
     log = put_down(three_laps(), SECOND_LAP, distance)
-    return log, map_beginning(three_laps(), round(10.0 * SECOND_LAP), SETTINGS)
+    return log, map_beginning(three_laps(), round(10.0 * SECOND_LAP))
 
 
 @cache
 def clean() -> tuple[Log, FixedLagMapper, list[CycleResult]]:
     log = laps_log(pear_track(), laps=2)
-    return log, *map_log(log, FixedLagMapper(SETTINGS, log.noise))
+    return log, *map_log(log, FixedLagMapper(log.noise))
 
 
 def apart(log: Log, results: list[CycleResult]) -> Array:
@@ -122,7 +118,7 @@ def test_the_map_does_not_move_while_the_vehicle_is_lost() -> None:
 def test_two_places_that_look_alike_are_not_told_apart() -> None:
     log = put_down(laps_log(pear_track(skew=0.0)), SECOND_LAP, 12.0)
     log = replace(log, cycles=log.cycles[: round(10.0 * (SECOND_LAP + 15.0))])
-    _, results = map_log(log, FixedLagMapper(SETTINGS, log.noise))
+    _, results = map_log(log, FixedLagMapper(log.noise))
     assert results[-1].health.condition == LOST
     assert FOUND not in {result.notice for result in results}
 
