@@ -15,16 +15,8 @@ import numpy as np
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.covariances import covariances_of
-from pathspace_graph.io.parsing import (
-    DELIMITERS,
-    MAX_STAMP,
-    Table,
-    is_number,
-    read_table,
-    read_text,
-    shown,
-)
-from pathspace_graph.io.results import read_trajectory
+from pathspace_graph.io.parsing import MAX_STAMP, Table, is_number, read_text, shown
+from pathspace_graph.io.tables import DELIMITERS, read_table, read_trajectory
 from pathspace_graph.labels import UNKNOWN
 
 from .messages import ALONE, BROKEN, Points, cone_points, scan_points, yaw_of
@@ -87,7 +79,7 @@ def read_csv(
     else:
         file = _File(ODOMETRY, read_table(odometry, (), delimiters=DELIMITERS), named, used)
         motion, are_poses = _motion(file, from_poses=from_poses)
-        t, rows = file.stamps(), file.table.lines
+        t, rows = file.stamps(), file.table.rows
     scans = _scans(_File(DETECTIONS, read_table(detections, (), delimiters=DELIMITERS), named, used), rule)
     in_words = ", ".join(f"{quantity} in {unit}" for quantity, unit in sorted(used.items()))
     return Recording(

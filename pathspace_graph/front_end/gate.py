@@ -25,7 +25,6 @@ from pathspace_graph.io.log import (
     Detections,
     Log,
     Odometry,
-    read_log,
 )
 from pathspace_graph.labels import LEFT, NAMES
 from pathspace_graph.lengths import joined, scaled
@@ -116,13 +115,6 @@ class Gate(Copyable):
 
     def refuse(self) -> None:
         self.refused += 1
-
-
-def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
-    """Read a log and check all its cycles; an unusable one raises an InputError with file, row and stamp."""
-    log = read_log(folder)
-    check_usable(log, folder, limits)
-    return log
 
 
 def check_usable(log: Log, folder: Path, limits: LimitSettings) -> None:

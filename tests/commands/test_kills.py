@@ -16,7 +16,8 @@ from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.metrics.measures import Row
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import atomic_file, atomic_folder
-from pathspace_graph.io.log import Log, read_log, write_log
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.settings.mapper import MapperSettings
 

@@ -18,7 +18,8 @@ from pathspace_graph.convert.messages import ALONE, DENSE, Points, points_of
 from pathspace_graph.convert.recording import MessageStream
 from pathspace_graph.convert.settings import Frames, LabelRule
 from pathspace_graph.estimators import make_online
-from pathspace_graph.io.log import Log, Odometry, read_log
+from pathspace_graph.io.log import Log, Odometry
+from pathspace_graph.io.log_files import read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings

@@ -17,9 +17,11 @@ from pathspace_graph.eval.experiment.run import make_plan
 from pathspace_graph.eval.experiment.runner import read_record, write_record
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.frames import read_cycles
-from pathspace_graph.io.log import FILES, read_log, write_log
+from pathspace_graph.io.log import FILES
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.results import read_trajectory, write_result
+from pathspace_graph.io.results import write_result
+from pathspace_graph.io.tables import read_trajectory
 
 from ..scenes.pretenders import write_round_track
 from .test_log import small_log

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth, read_log, write_log
+from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.parsing import MAX_HELD, MAX_RANGE
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
@@ -156,7 +157,7 @@ BAD_ROWS = [
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.5,1,0,-inf\n", 3, "finite number in column 'wz'"),
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1,1,0,0\n1,1,0,0\n", 4, "later than the row before"),
     ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1,1,0,0\n0.5,1,0,0\n", 4, "later than the row before"),
-    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n\n1,1,0\n", 4, "expected 4 fields, found 3"),
+    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n\n1,1,0\n", 4, "expected a number in column 'wz', found ''"),
     ("odometry.csv", "t,vx,vy,wz\n0,1,,0\n", 2, "number in column 'vy', found ''"),
     ("odometry.csv", "t,vx,vy,wz,t\n0,1,0,0,0\n", 1, "more than one"),
     (

@@ -230,7 +230,7 @@ def _change_first(path: str, value: Any) -> Change:
         (_set("boundaries.left.knots", [0.0, 1.0]), "boundaries.left"),
         (_change_first("boundaries.left.knots", 1e9), "boundaries.left"),
         (_change_first("boundaries.left.knots", "x"), "boundaries.left.knots"),
-        (_change_first("boundaries.left.knots", float("nan")), "boundaries.left.knots"),
+        (_change_first("boundaries.left.knots", float("nan")), "row 1: expected JSON"),
         (_set("boundaries.left.control_points", []), "boundaries.left"),
         (_set("boundaries.left.control_points", {}), "boundaries.left.control_points"),
         (_change_first("boundaries.left.control_points", [1.0]), "boundaries.left.control_points"),

@@ -10,13 +10,8 @@ import numpy as np
 
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.map import Map, PointBoundary
-from pathspace_graph.io.results import (
-    SMOOTHED_FILE,
-    CycleRecord,
-    RunResult,
-    read_trajectory,
-    write_result,
-)
+from pathspace_graph.io.results import SMOOTHED_FILE, CycleRecord, RunResult, write_result
+from pathspace_graph.io.tables import read_trajectory
 from pathspace_graph.labels import LEFT
 
 

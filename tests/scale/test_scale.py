@@ -27,16 +27,16 @@ from pathspace_graph.estimators import ONLINE, make_batch, make_online
 from pathspace_graph.eval.metrics.measures import measure
 from pathspace_graph.eval.metrics.summary import laps_of, summarize
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
-from pathspace_graph.front_end.gate import read_usable_log
 from pathspace_graph.health import Health
-from pathspace_graph.io.log import Detections, Log, Odometry, write_log
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.lengths import POSE_LENGTHS, Length, Text, joined, scaled, times
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.plausibility.diagnosis import diagnose, measured_line
-from pathspace_graph.plausibility.judge import hints
+from pathspace_graph.plausibility.judge import hints, read_usable_log
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.scale import SCALES, SCENE_ENOUGH, SCENE_PATIENCE, SceneScale, scale_of, width_and_gap
 from pathspace_graph.settings.mapper import BatchSettings, MapperSettings
