@@ -16,6 +16,7 @@ from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
+from pathspace_graph.provenance import made
 
 from .brief import Brief, frames
 from .files import atomic_folder, write_json, write_table
@@ -239,7 +240,7 @@ def write_result(
     """Write map.json, the trajectories, cycles.csv and summary.json to a folder, as by `atomic_folder`.
 
     An earlier map is replaced if `force`. Where several drives were mapped at once, trajectory and cycles of
-    each are in a folder of its name.
+    each are in a folder of its name. The summary also says by which commit, where and when it was `made`.
     """
     with atomic_folder(folder, MAP_FILE, force=force) as temporary:
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
@@ -248,7 +249,7 @@ def write_result(
             own = temporary / DRIVES_FOLDER / name
             own.mkdir(parents=True)
             _write_drive(own, drive)
-        write_json(temporary / "summary.json", summary)
+        write_json(temporary / "summary.json", {**summary, "made": made()})
 
 
 def _write_drive(folder: Path, result: RunResult) -> None:

@@ -15,12 +15,12 @@ from scipy.spatial import KDTree
 from pathspace_graph.cli import main
 from pathspace_graph.convert.lines import DrivenPath, along_lines, are_lines, lines_of, resampled, thinned
 from pathspace_graph.convert.messages import ALONE, DENSE, Points, points_of
-from pathspace_graph.convert.recording import MessageStream
 from pathspace_graph.convert.settings import Frames, LabelRule
 from pathspace_graph.estimators import make_online
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.io.log_files import read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.ros.stream import MessageStream
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import sampled
