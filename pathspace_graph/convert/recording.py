@@ -248,6 +248,7 @@ def _possible(record: Recording, rows: Array, file: Path) -> BoolArray:
     """
     numbers, t, values = rows[:, 0].astype(int), rows[:, 1], rows[:, 2:]
     beyond, off = twists.beyond_limits(values), twists.jumps(t, values)
+    notes = record.notes
 
     def told(row: int, column: int) -> str:
         name, unit = (("vx", "m/s"), ("vy", "m/s"), ("wz", "rad/s"))[column]
@@ -273,7 +274,7 @@ def _possible(record: Recording, rows: Array, file: Path) -> BoolArray:
         if column == 2 and min(abs(turn - 1.0), abs(turn - 2.0)) < 1.0 - twists.WRAP_SHARE:
             cause = "the yaw was differenced where it wraps by a whole turn"
         where = f"{told(first, column)}, where {cause}, in {record.at(numbers[wrong])}"
-        record.notes[f"odometry samples can't be, and were left out as a gap: {where}"] += int(wrong.sum())
+        notes[f"odometry samples can't be, and were left out as a gap: {where}"] += int(wrong.sum())
     return np.asarray(~wrong)
 
 

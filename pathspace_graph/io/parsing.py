@@ -155,6 +155,7 @@ def typed(value: Any, kind: type[T], file: Path, where: str = "", *, strict: boo
         return msgspec.convert(value, kind, strict=strict)
     except msgspec.ValidationError as error:
         said, _, at = str(error).replace("`", "").partition(" - at ")
+        said = said.replace("Number out of range", "Expected a smaller number")
         path = at.rpartition("$")[2].removeprefix(".")
         missing = "".join(re.findall("missing required field (.*)", said))
         key = ".".join(filter(None, (where, path, missing)))

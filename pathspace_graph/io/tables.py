@@ -98,6 +98,6 @@ def _read_csv(file: Path, text: str, width: int, **form: Any) -> pd.DataFrame:
         raise InputError(
             file, f"expected a table of texts: {told}", int(row[1]) + 1 if row else None
         ) from None
-    frame.index += 1
+    frame = frame.set_axis(frame.index + 1)
     begins_empty = frame[frame[0] == ""]
     return frame.drop(begins_empty.index[(begins_empty == "").all(axis=1)])

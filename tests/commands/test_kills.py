@@ -47,6 +47,12 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
         return Recorded(short, run_estimator("rings", MapperSettings(), short))
 
 
+@pytest.fixture(autouse=True)
+def at_one_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every run writes the same bytes."""
+    monkeypatch.setattr("pathspace_graph.io.results.made", lambda: {"date": "then"})
+
+
 def write_map(recorded: Recorded, out: Path) -> None:
     write_result(out, recorded.result, {"estimator": "rings"}, force=True)
 

@@ -69,3 +69,6 @@ TARGETS = {
     "track": Target({"track.yaml": "", "track.csv": ""}, read_tracks),
     "study": Target({"study.toml": ""}, lambda folder: read_study_file(folder / "study.toml")),
 }
+INPUTS = sorted(file for file in Path(__file__).with_name("corpus").rglob("*") if file.is_file())
+READ = {"good", "quoted", "splines", "points", "eufs", "tum", "pacsim", "fssim"}
+"""Inputs of the corpus of these names are read, all others are refused."""
