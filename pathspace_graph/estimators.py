@@ -5,19 +5,17 @@ A package adds one by an entry point of its name, in the group `pathspace_graph.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Final
 
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.noise import KnownNoise
-from pathspace_graph.front_end.kind import with_kind
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.overrides import override
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.scale import chosen_scale
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
 from .errors import SettingsError, check_name, check_type
@@ -32,7 +30,7 @@ ONLINE_GROUP: Final = "pathspace_graph.online"  # group of entry points that add
 BATCH_GROUP: Final = "pathspace_graph.batch"  # group of entry points that add batch estimators
 PARAMETERS: Final = "Parameters"  # attribute of a maker: a frozen dataclass of its own parameters
 READS: Final = "READS"  # attribute of a maker: the settings that it reads, by field or group; all without it
-ALWAYS_READ: Final = ("scale", "kind", "limits", "calibration", "odometry")
+ALWAYS_READ: Final = ("kind", "limits", "calibration", "odometry")
 """Settings that are read before an estimator is made, and by what judges its calibration."""
 
 _ENTRY_POINTS: Final = entry_points()  # looked up once, since that reads the metadata of every package
@@ -159,7 +157,7 @@ def check_batch(name: str) -> None:
 
 
 def make_online(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> OnlineEstimator:
-    """Return an online estimator for a log, which tells the scale where the settings leave it open."""
+    """Return an online estimator for a log, which tells the kind of detections and their noise."""
     check_online(name)
     own = parameters or parameters_of(name)
     made: OnlineEstimator = _make(ONLINE[name], settings_of(settings, log), log.noise, own)
@@ -167,9 +165,8 @@ def make_online(name: str, settings: MapperSettings, log: Log, parameters: Any =
 
 
 def settings_of(settings: MapperSettings, log: Log) -> MapperSettings:
-    """Return settings with what they leave open and a log tells: the scale, and the kind of the sensor."""
-    settings = known_settings(settings)
-    return with_kind(replace(settings, scale=chosen_scale(settings, log)), log)
+    """Return settings with the kind of detections that a log states, where they leave it open."""
+    return known_settings(settings).with_kind(log.sensor.kind)
 
 
 def make_batch(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> BatchEstimator:

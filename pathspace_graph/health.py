@@ -5,12 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from math import nan
-from typing import ClassVar, Final
+from typing import Final
 
 from pathspace_graph.copies import Copyable
 
 from .labels import BOUNDARIES, NAMES
-from .lengths import Length, Text
 
 GOOD: Final = "good"
 DEGRADED: Final = "degraded"
@@ -33,8 +32,6 @@ SIGMA_LOST: Final = 5.0  # standard deviation beyond which the vehicle is lost (
 @dataclass(frozen=True)
 class Health:
     """Health of the estimate in a cycle."""
-
-    LENGTHS: ClassVar = {"reason": 0}
 
     condition: str = ""  # good, degraded or lost; empty without a monitor
     reason: str = ""  # reason, if the condition is not good
@@ -126,7 +123,7 @@ class HealthMonitor(Copyable):
         degraded = SHARE_DEGRADED if newest.closed else OPEN_DEGRADED
         blind = newest.t - (newest.t if self._last_offered is None else self._last_offered)
         if newest.sigma > SIGMA_DEGRADED:
-            uncertain = Text("the position is uncertain by {sigma:.2g} m", sigma=Length(newest.sigma))
+            uncertain = f"the position is uncertain by {newest.sigma:.2g} m"
             return Health(LOST if newest.sigma > SIGMA_LOST else DEGRADED, uncertain)
         if share < degraded:
             wrong = self._wrong_side() if share < lost and newest.closed else ""

@@ -8,7 +8,7 @@ LABELS: Final = {name: label for label, name in enumerate(NAMES)}
 BOUNDARIES: Final = (LEFT, RIGHT)
 POINTS: Final = (ORANGE, BIG_ORANGE)  # of no boundary: at gates, and along lanes to a track
 
-Kind = Literal["cones", "line", "line-left", "line-right"]  # kind of detections, on both sides or on one
+Kind = Literal["cones", "line"]  # of detections: they stay where they are, or lie anywhere along a line
 KINDS: Final = get_args(Kind)
 
 _CODES: Final = LABELS | {

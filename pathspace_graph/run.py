@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from functools import cached_property
 from math import nan
 from operator import methodcaller
-from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -20,9 +20,9 @@ from pathspace_graph.io.brief import Brief
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
-from pathspace_graph.lengths import POSE_LENGTHS, times
+from pathspace_graph.lengths import scaled
 
-from .errors import check_type
+from .errors import check_type, solving
 from .health import Health
 from .labels import LEFT, RIGHT
 from .laps import LapCounter
@@ -33,8 +33,6 @@ Result = TypeVar("Result", bound=RunResult)
 @dataclass(frozen=True, eq=False, repr=False)
 class CycleResult(Brief):
     """Result of an online estimator in one perception cycle."""
-
-    LENGTHS: ClassVar = {"pose": POSE_LENGTHS, "jump": POSE_LENGTHS, "notice": 0, "health": 0}
 
     t: float
     """Stamp of the cycle (s)."""
@@ -90,8 +88,6 @@ class BatchEstimator(Protocol):
 class Readings:
     """Detections of the newest cycle with their use, placed by the newest pose."""
 
-    LENGTHS: ClassVar = {"points": 1, "feet": 1}
-
     points: Array
     """Detected positions (k, 2) in m, map frame, corrected by the calibration."""
     labels: IntArray
@@ -100,11 +96,6 @@ class Readings:
     """Whether each detection (k,) is in use; the others were gated."""
     feet: Array
     """Foot point (k, 2) of each used detection on its curve or landmark, in m, map frame; otherwise NaN."""
-
-
-def scale(estimator: OnlineEstimator) -> float:
-    """Return the scale of the scene of an estimator; 1 for one without a scale."""
-    return float(getattr(estimator, "scale", 1.0))
 
 
 def _ask(estimator: OnlineEstimator, method: str, *arguments: Any) -> Any:
@@ -261,16 +252,27 @@ def run_online(
     The result has copies of the map at the `snapshot_times` (s, ascending) and at the end of each lap; with
     `outlines` they have no covariances, which take most of the memory of a long drive. `observers` are called
     after each cycle, and their time is not counted. BLAS runs on one thread. Between cycles the run waits for
-    batches, and garbage collection excludes objects older than the run.
+    batches, and garbage collection excludes objects older than the run. Estimator and observers see lengths
+    divided by the scale of the log, the result has them in metres of the log.
     """
     check_type("log", log, Log)
     check_type("estimator", estimator, OnlineEstimator)
     map_of = outline_of if outlines else methodcaller("map")
     run = _Run(estimator, map_of, [float(t) for t in snapshot_times], observers)
     with threadpool_limits(limits=1), spared_by_collector():
-        for odometry, detections in split_odometry(log):
+        for odometry, detections in split_odometry(log.at_scale_one()):
             run.cycle(odometry, detections)
-        return run.result(name)
+        return scaled(run.result(name), log.scale)
+
+
+def solved(solve: Callable[[Log], Result], log: Log) -> Result:
+    """Solve a batch at scale 1, and return its result in metres of the log.
+
+    BLAS runs on one thread, and a numerical failure raises a SolveError.
+    """
+    check_type("log", log, Log)
+    with threadpool_limits(limits=1), solving("the batch"):
+        return scaled(solve(log.at_scale_one()), log.scale)
 
 
 class _Run:
@@ -292,7 +294,7 @@ class _Run:
         self._waited += timed_wait(self._estimator)
         result, seconds, processor = timed_update(self._estimator, odometry, detections)
         lap_before = self._laps.lap
-        lap = self._laps.update(times(np.asarray(result.pose), POSE_LENGTHS, 1.0 / scale(self._estimator)))
+        lap = self._laps.update(np.asarray(result.pose))
         if lap > lap_before:
             self._lap_maps.append((lap_before, self._map_of(self._estimator)))
         self._poses.extend(result.pose)
@@ -333,7 +335,6 @@ class _Run:
             batches=_ask(estimator, "batches"),
             waited=self._waited,
             noise=_ask(estimator, "noise_used"),
-            scale=scale(estimator),
             smoothed=np.where(is_smoothed, smoothed, trajectory) if is_smoothed.any() else None,
         )
 

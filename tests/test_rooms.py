@@ -31,7 +31,6 @@ LEAVES = {"errors", "labels", "console", "lengths", "copies", "provenance"}
 ESTIMATORS = {"online", "batch", "baselines"}
 BELOW_MAPPING = {
     *("factors", "settings", "spline", "io", "graph", "laps", "health", "run"),
-    "scale",
 }
 BELOW_ESTIMATORS = BELOW_MAPPING | {"mapping", "front_end"}
 BELOW_EVAL = BELOW_ESTIMATORS | ESTIMATORS | {"loop", "sim", "estimators", "plausibility", "options"}
@@ -49,10 +48,9 @@ ARROWS: dict[str, set[str]] = {
     "graph": {"factors"},
     "health": set(),
     "run": {"factors", "io", "laps", "health"},
-    "scale": {"factors", "settings", "io", "run"},
     "mapping": BELOW_MAPPING,
     "front_end": BELOW_MAPPING | {"mapping"},
-    "plausibility": {"factors", "settings", "spline", "io", "health", "front_end", "scale"},
+    "plausibility": {"factors", "settings", "spline", "io", "health", "run", "front_end"},
     **dict.fromkeys(sorted(ESTIMATORS), BELOW_ESTIMATORS),
     "loop": BELOW_ESTIMATORS | {"batch"},  # the open lap is solved as a batch when the loop closes
     "online": BELOW_ESTIMATORS | {"loop"},

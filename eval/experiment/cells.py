@@ -16,6 +16,7 @@ from pathspace_graph.io.files import to_plain
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.results import RunResult, write_result
+from pathspace_graph.lengths import times
 from pathspace_graph.plausibility.diagnosis import diagnose
 from pathspace_graph.plausibility.hint import Hint
 from pathspace_graph.run import run_online, with_own
@@ -60,7 +61,8 @@ class EstimatorCell(Cell):
         took = wall, sum(record.processor for record in cycles) if cycles else processor
         rows = measure(result, log, took)
         said = [record.notice for record in result.cycles if record.notice]
-        said += [] if result.vehicle is None else diagnose(result.vehicle, result.settings, result.scale)
+        vehicle = result.at_scale_one().vehicle
+        said += [] if vehicle is None else diagnose(vehicle, result.settings)
         return {
             "notices": "; ".join(dict.fromkeys(said)),
             "lap_count": result.laps,
@@ -74,10 +76,10 @@ def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any
     """Run an online estimator, with its reach and its map at the end of each true lap, or a batch one."""
     if name not in registry.ONLINE:
         return with_own(registry.make_batch(name, settings, log, parameters).solve(log), parameters)
-    estimator, truth = registry.make_online(name, settings, log, parameters), log.truth
+    estimator, truth = registry.make_online(name, settings, log, parameters), log.at_scale_one().truth
     observers = [ReachObserver(truth)] if has_cones(truth) and len(truth.poses) else []
     result = run_online(log, estimator, name=name, snapshot_times=lap_times(log), observers=observers)
-    result = replace(result, reach=observers[0].rows) if observers else result
+    result = replace(result, reach=times(observers[0].rows, (1, 2, 0), log.scale)) if observers else result
     return with_own(result, parameters)
 
 

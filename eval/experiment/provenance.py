@@ -19,7 +19,7 @@ from pathspace_graph.provenance import commit_of, machine, now
 
 HOUSE: Final = __name__.partition(".")[0]
 MEASURED: Final = (  # modules on which every result depends, whatever the estimator is
-    *("run", "scale", "front_end.kind", "sim.simulate", "sim.track_generator", "plausibility.diagnosis"),
+    *("run", "sim.simulate", "sim.track_generator", "plausibility.diagnosis"),
     "eval.metrics.measures",
 )
 NUMERICS: Final = {name: version(name) for name in ("gtsam", "numpy", "scipy")}

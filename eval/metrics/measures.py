@@ -12,7 +12,6 @@ from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
-from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import by_prior
 
 from . import accuracy, trajectory
@@ -84,7 +83,7 @@ def measure(
     ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and so one
     row, that of the last lap. `took` is the wall time and the processor time of the whole run (s).
     """
-    run, log = run.at_scale_one(), scaled(log, 1.0 / run.scale)
+    run, log = run.at_scale_one(), log.at_scale_one()
     rows = []
     for lap, track, begin, end in _laps(run, log):
         of_map = _map_values(track, log.truth)
@@ -98,10 +97,7 @@ def measure(
     if any(health):
         values |= {f"reported_{level}": health.count(level) / len(health) for level in (DEGRADED, LOST)}
     if run.vehicle is not None:
-        values |= {
-            f"{name}_by_prior": value
-            for name, value in by_prior(run.vehicle, run.settings, run.scale).items()
-        }
+        values |= {f"{name}_by_prior": value for name, value in by_prior(run.vehicle, run.settings).items()}
     if isinstance(run, BatchRun):
         values |= {"converged": run.converged, "cost": run.cost}
     if took is not None:

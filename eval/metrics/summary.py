@@ -19,7 +19,6 @@ from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
-from pathspace_graph.scale import scale_of
 from pathspace_graph.spline.crossing import Crossing
 
 from .accuracy import LapMetrics, lap_metrics, root_mean_square, true_lap_ends
@@ -36,7 +35,6 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         "settings": result.settings,
         "scale": result.scale,
         "sensor_kind": result.settings.get("kind") or log.sensor.kind or "cones",
-        "sensor_kind_known": bool(result.settings.get("kind") or log.sensor.kind),
         "versions": versions(),
         "lap_count": result.laps,
         "closed": result.map.closed,
@@ -52,7 +50,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         summary["hints"] = [vars(hint) for hint in hints]
     if result.noise is not None:
         summary["noise"] = _noise(result.noise, log)
-        notes = noise_lines(result.noise, result.scale)
+        notes = noise_lines(scaled(result.noise, 1.0 / result.scale))
         summary |= {"notes": notes} if notes else {}
     if result.vehicle is not None:
         summary |= _calibration(result.vehicle, result)
@@ -84,7 +82,7 @@ def _calibration(state: VehicleState, result: RunResult) -> dict[str, Any]:
     """Calibrations with their sigmas, and a diagnosis where one is far from its prior."""
     values = {name: value for name, (value, _) in state.by_name.items()}
     values |= {f"{name}_sigma": sigma for name, (_, sigma) in state.by_name.items()}
-    found = diagnose(state, result.settings, result.scale)
+    found = diagnose(scaled(state, 1.0 / result.scale), result.settings)
     calibration = {"calibration": values, "heading_sigma": float(state.sigmas[2])}
     return calibration | ({"diagnosis": found} if found else {})
 
@@ -140,7 +138,7 @@ def lap_times(log: Log) -> Array:
     """Return the stamps (s) at which true laps end; without a true path there are none."""
     if log.truth is None or len(log.truth.poses) == 0:
         return np.zeros(0)
-    return log.truth.pose_t[true_lap_ends(scaled(log.truth, 1.0 / scale_of(log)))]
+    return log.truth.pose_t[true_lap_ends(scaled(log.truth, 1.0 / log.scale))]
 
 
 def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:

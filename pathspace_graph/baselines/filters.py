@@ -14,7 +14,6 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.lengths import scaled
 from pathspace_graph.loop.closing import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 from pathspace_graph.mapping import registration
 from pathspace_graph.mapping.curve_map import CurveMap
@@ -46,7 +45,7 @@ class _Filter(OnlineBaseline):
         self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
 
     def vehicle_state(self) -> VehicleState:
-        return scaled(self.belief.vehicle_state(), self.scale)
+        return self.belief.vehicle_state()
 
 
 class CkfMapper(_Filter):

@@ -28,8 +28,7 @@ from pathspace_graph.labels import BOUNDARIES, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.mapping.tentative import TentativeTracks
-from pathspace_graph.run import settings_dict, split_odometry
-from pathspace_graph.scale import solved
+from pathspace_graph.run import settings_dict, solved, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
 from . import landmark_association as association
@@ -57,10 +56,10 @@ class LandmarkBatch:
         known_noise(odometry_sigma)  # check it early
 
     def solve(self, log: Log) -> BatchRun:
-        return solved(self._solve, log, self.settings)
+        return solved(self._solve, log)
 
-    def _solve(self, log: Log, scale: float) -> BatchRun:
-        noise = known_noise(self.odometry_sigma, scale)
+    def _solve(self, log: Log) -> BatchRun:
+        noise = known_noise(self.odometry_sigma)
         system, state = start_online(log, LandmarkSystem.of_log(log, self.settings, noise), noise)
         system.optimize(state)
         for _ in range(MAX_ROUNDS):
@@ -68,7 +67,7 @@ class LandmarkBatch:
             system.optimize(state)
             if converged:
                 break
-        return self._result(system, state, scale, converged)
+        return self._result(system, state, converged)
 
     def _refresh(self, system: "LandmarkSystem", state: LandmarkState) -> int:
         detections, before, known = system.detections, system.detections.landmark.copy(), len(state)
@@ -79,15 +78,13 @@ class LandmarkBatch:
         remove_rare(state, detections, self.settings.growth.sightings)
         return int((before != detections.landmark).sum())
 
-    def _result(
-        self, system: "LandmarkSystem", state: LandmarkState, scale: float, converged: bool
-    ) -> BatchRun:
+    def _result(self, system: "LandmarkSystem", state: LandmarkState, converged: bool) -> BatchRun:
         laps, problem, poses = LapCounter(), system.eliminated(state), state.variables.poses.copy()
         for pose in poses:
             laps.update(pose)
         return BatchRun(
             estimator=LANDMARK_BATCH,
-            settings=settings_dict(replace(self.settings, scale=scale)),
+            settings=settings_dict(self.settings),
             map=point_map(state.landmarks, state.labels, problem.joint(state.keys), laps.completed > 0),
             trajectory_t=system.chain.stamps,
             trajectory=poses,
@@ -150,7 +147,7 @@ class LandmarkSystem:
 
 def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[LandmarkSystem, LandmarkState]:
     """Return the last map of the online run, with each pose and association as of its end in the window."""
-    online = LandmarkFixedLag(replace(system.settings, scale=1.0), noise)
+    online = LandmarkFixedLag(system.settings, noise)
     detections, smoother, track = system.detections, online.smoother, online.smoother.map
     poses = np.zeros((len(log.cycles), POSE))
     landmark = np.full(len(detections), UNASSOCIATED, np.intp)

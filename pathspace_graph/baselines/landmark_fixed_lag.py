@@ -17,7 +17,6 @@ from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.lengths import POSE_LENGTHS, scaled, times
 from pathspace_graph.mapping import motion as motions
 from pathspace_graph.mapping.motion import predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
@@ -159,8 +158,7 @@ class LandmarkFixedLag(OnlineBaseline):
         return point_map(state.landmarks, state.labels, None, self.closed)
 
     def window_poses(self) -> Array:
-        poses: Array = times(self.smoother.variables.poses.copy(), POSE_LENGTHS, self.scale)
-        return poses
+        return self.smoother.variables.poses.copy()
 
     def readings(self) -> Readings:
         table, state = self.smoother.map.detections, self.smoother.map.state
@@ -169,10 +167,10 @@ class LandmarkFixedLag(OnlineBaseline):
         points = table.points_map(rows, self.smoother.variables)
         feet = np.full(points.shape, np.nan)
         feet[used] = state.landmarks[state.positions(table.landmark[rows[used]])]
-        return scaled(Readings(points, table.label[rows], used, feet), self.scale)
+        return Readings(points, table.label[rows], used, feet)
 
     def vehicle_state(self) -> VehicleState:
-        return scaled(vehicle_state(self.smoother), self.scale)
+        return vehicle_state(self.smoother)
 
 
 class JointCompatibility:

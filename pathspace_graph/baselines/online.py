@@ -1,4 +1,4 @@
-"""Base of the online baselines: the mapper's front end, and the scale of the scene."""
+"""Base of the online baselines: the mapper's front end."""
 
 from abc import abstractmethod
 from typing import Final
@@ -9,7 +9,6 @@ from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise
-from pathspace_graph.lengths import scaled
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
@@ -19,7 +18,7 @@ FRONT_END: Final = ("closing", "gate", "growth", "motion", "noise", "sides", "sp
 
 
 class OnlineBaseline:
-    """Online estimator; a subclass maps the readings of the front end at scale 1.
+    """Online estimator; a subclass maps the readings of the front end.
 
     `odometry_sigma` (3,) is the standard deviation of a twist reading (m/s, m/s, rad/s).
     """
@@ -28,8 +27,7 @@ class OnlineBaseline:
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
         self.settings = known_settings(settings)
-        self.scale = self.settings.scale or 1.0
-        self.front_end = FrontEnd(self.settings, known_noise(odometry_sigma, self.scale), self.scale)
+        self.front_end = FrontEnd(self.settings, known_noise(odometry_sigma))
         self._begin()
 
     @abstractmethod
@@ -48,13 +46,13 @@ class OnlineBaseline:
 
     @abstractmethod
     def _map(self, with_covariance: bool) -> Map:
-        """Return a copy of the map at scale 1."""
+        """Return a copy of the map."""
 
     def map(self) -> Map:
-        return scaled(self._map(True), self.scale)
+        return self._map(True)
 
     def outline(self) -> Map:
-        return scaled(self._map(False), self.scale)
+        return self._map(False)
 
     def noise_used(self) -> RunNoise:
-        return scaled(self.front_end.noise_used, self.scale)
+        return self.front_end.noise_used

@@ -244,7 +244,7 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
     def along(chosen: BoolArray | IntArray) -> tuple[Array, Array, Array, float, bool, MapperSettings]:
         return points[chosen], u[chosen], covariances[chosen], boundary.length, boundary.periodic, settings
 
-    if label in settings.lines:
+    if settings.of_lines:
         return points_along(*along(on_curve))
     cones = cluster(*along(on_curve))
     if len(cones.u) == 0:

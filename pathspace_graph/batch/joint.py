@@ -151,7 +151,8 @@ def joint_state(system: JointSystem, known: PlacedDrive) -> State:
 
 def revisits_between(system: JointSystem, state: State) -> list[Revisit]:
     """Return poses of each later drive in the frame of one of an earlier drive, by their common cones."""
-    table, settings, found = system.detections.cones(system.settings.lines), system.settings, list[Revisit]()
+    settings, found = system.settings, list[Revisit]()
+    table = system.detections.cones(settings.of_lines)
     table.correct(state.variables.sensor)
     driven = path_lengths(state.poses)
     for part in system.drives.parts(len(driven))[1:]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.errors import SolveError, solving
+from pathspace_graph.errors import SettingsError, SolveError, solving
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, path_lengths
 from pathspace_graph.io.log import Log
@@ -14,7 +14,6 @@ from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.io.moved import moved
 from pathspace_graph.lengths import scaled
 from pathspace_graph.run import Stopwatch
-from pathspace_graph.scale import chosen_scale
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .joint import JointSystem, PlacedDrive, joint_state, revisits_between
@@ -48,7 +47,9 @@ def solve_together(
     nowhere on the map of the others, is left out. SolveError if none is left.
     """
     settings = known_settings(settings)
-    settings = replace(settings, scale=chosen_scale(settings, next(iter(logs.values()))))
+    scales = {name: log.scale for name, log in logs.items()}
+    if len(set(scales.values())) > 1:
+        raise SettingsError(f"scale: expected logs of one scale, found {scales}")
     alone, left_out = dict[str, BatchResult](), dict[str, str]()
     for name, log in logs.items():
         try:

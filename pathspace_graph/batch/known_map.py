@@ -40,11 +40,11 @@ class KnownMap:
     kept: bool  # whether the map is fixed
 
     @classmethod
-    def of(cls, track: Map, keep: bool = False, lines: tuple[int, ...] = ()) -> Self:
+    def of(cls, track: Map, keep: bool = False, of_lines: bool = False) -> Self:
         """Build the known map from a map with both curves; `keep` fixes it.
 
-        The cones of boundaries that are `lines` for the sensor are dropped. SettingsError for a map without
-        both curves or without covariances.
+        Cones are dropped for a sensor of lines. SettingsError for a map without both curves or without
+        covariances.
         """
         boundaries = track.curves("a known map")
         covariance = track.covariance_of(*boundaries)
@@ -56,7 +56,7 @@ class KnownMap:
             splines[label], change = _floating(boundary.spline)
             changes.append(np.kron(change, np.eye(POINT)))
             confirmed[label] = min(boundary.confirmed_until, boundary.spline.domain[1])
-            cones[label] = NO_CONES if label in lines else boundary.cones
+            cones[label] = NO_CONES if of_lines else boundary.cones
         T = block_diag(*changes)
         floor = FLOOR**2 * np.eye(len(T))
         joint = KEPT**2 * np.eye(len(T)) if keep else T @ covariance @ T.T + floor

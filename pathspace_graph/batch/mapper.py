@@ -14,7 +14,6 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.se2 import compose, inverse
 from pathspace_graph.front_end.front_end import JudgedLog, judge_log
-from pathspace_graph.front_end.kind import with_kind
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
@@ -34,8 +33,7 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import known_noise, vehicle_of, with_inflated_priors, with_size
 from pathspace_graph.mapping.orange import OrangeCones, Sighting
 from pathspace_graph.mapping.state import State
-from pathspace_graph.run import Stopwatch, settings_dict
-from pathspace_graph.scale import solved
+from pathspace_graph.run import Stopwatch, settings_dict, solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .gtsam_graph import nonlinear_graph
@@ -145,8 +143,8 @@ class BatchMapper:
         SettingsError if the start needs an online mapper and there is none, SolveError if the log does not
         determine an optimum.
         """
-        settings = with_kind(self.settings, log)
-        return solved(partial(self._solve, settings, start, on_round), log, settings)
+        settings = self.settings.with_kind(log.sensor.kind)
+        return solved(partial(self._solve, settings, start, on_round), log)
 
     def _solve(
         self,
@@ -154,13 +152,12 @@ class BatchMapper:
         start: Start | None,
         on_round: Callable[[], None] | None,
         log: Log,
-        scale: float,
     ) -> BatchResult:
-        watch, noise = Stopwatch(), known_noise(self.odometry_sigma, scale)
+        watch, noise = Stopwatch(), known_noise(self.odometry_sigma)
         judged = judge_log(log, noise, own_settings(settings))
         watch.lap("integrate")
-        start, given = start or settings.batch.start, replace(settings, scale=scale)
-        begun, online = self._search(log, judged, replace(settings, scale=1.0), noise, start, on_round, watch)
+        start = start or settings.batch.start
+        begun, online = self._search(log, judged, settings, noise, start, on_round, watch)
         found, known = with_wider_priors(begun)
         watch.lap("optimum")
         solved_map = map_of(found, known, _orange(judged, found.at.state), watch)
@@ -168,7 +165,7 @@ class BatchMapper:
             found,
             known,
             solved_map,
-            settings=settings_dict(given),
+            settings=settings_dict(settings),
             noise=judged.noise,
             chain=judged.chain,
             online=online,
@@ -342,7 +339,7 @@ def _vehicle_of(found: Found, known: FactoredSystem, drive: int) -> VehicleState
 def _map_of_curves(few: Simplified, joint: Array, settings: MapperSettings) -> Map:
     """Return the curves with their cones, and their covariance plus the scatter of the cones."""
     state, boundaries = few.state, {}
-    has_cones = state.closed and not settings.lines
+    has_cones = state.closed and not settings.of_lines
     for label, boundary in state.boundaries.items():
         block = map_block(state, label)
         sigma = np.repeat(few.scatter.of_control_points(label, boundary), 2)

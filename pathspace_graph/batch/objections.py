@@ -10,7 +10,6 @@ from scipy.spatial import KDTree
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import path_lengths, to_map
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.lengths import Length, Text, joined
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.settings.mapper import MapperSettings
@@ -130,7 +129,7 @@ def unmapped(detections: DetectionTable, poses: Array) -> str:
     poor = (count >= MISS_DETECTIONS) & (np.bincount(stretch, missed, len(count)) >= MISS_SHARE * count)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], poor, [False]])))
     ends = np.minimum(MISS_STRETCH * edges.reshape(-1, 2), driven[-1]).tolist()[:MISS_SHOWN]
-    told = [Text("{a:.3g} to {b:.3g} m", a=Length(a), b=Length(b)) for a, b in ends]
-    where = Text(" ({stretches} of the drive)", stretches=joined(told, ", ")) if told else ""
-    said = "{share:.0f} % of the detections near the drive lie on no boundary{where}"
-    return Text(said, share=100.0 * missed.sum() / near.sum(), where=where)
+    told = ", ".join(f"{a:.3g} to {b:.3g} m" for a, b in ends)
+    where = f" ({told} of the drive)" if told else ""
+    share = 100.0 * missed.sum() / near.sum()
+    return f"{share:.0f} % of the detections near the drive lie on no boundary{where}"

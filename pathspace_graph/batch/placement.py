@@ -66,7 +66,7 @@ class Driven:
     def cones(self, begin: float = 0.0, end: float = np.inf) -> Constellation:
         """Return the cones detected on a stretch of the drive (m), in its frame."""
         cycles = np.flatnonzero((self.driven >= begin) & (self.driven < end))
-        table = seen_in(self.detections.cones(self.settings.lines))(cycles)
+        table = seen_in(self.detections.cones(self.settings.of_lines))(cycles)
         return Constellation.of(table, self.state.poses, self.settings.growth)
 
     @cached_property
@@ -88,12 +88,12 @@ def find_place(known: Driven, drive: Driven) -> Array:
 
     Hypotheses along an open road are ambiguous, so both drives must begin at about the same place there.
     """
-    least = LEAST_OF_LINE if drive.settings.lines else LEAST_DRIVEN
+    least = LEAST_OF_LINE if drive.settings.of_lines else LEAST_DRIVEN
     if drive.driven[-1] < least:
         raise NotPlacedError(f"it is shorter than {least:g} m")
     seen = sightings(drive)
     places = _around(known, drive, seen) if known.state.closed else _about_start(known, drive, seen)
-    if not drive.settings.lines:
+    if not drive.settings.of_lines:
         places = [place for place in places if cones_agree(known, drive, place.motion)]
     if not places:
         raise NotPlacedError(OTHER_TRACK)

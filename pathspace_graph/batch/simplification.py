@@ -38,7 +38,7 @@ def reknot(state: State, detections: DetectionTable, settings: MapperSettings, d
         points = cones.points
         if len(points) < ROW_CONES:
             continue
-        if not dense and label in settings.lines:
+        if not dense and settings.of_lines:
             spline = fit_line(state.spline(label), settings)
             state.replace_boundary(label, *boundary_of(spline, settings))
             continue

@@ -170,7 +170,7 @@ def all_cones(judged: JudgedLog) -> DetectionColumns:
     table = DetectionColumns.of([one.with_others(other) for one, other in pairs], twists=judged.chain.twists)
     calibration = judged.settings.calibration
     table.correct(np.array(calibration.means) if calibration.sensor else np.zeros(0))
-    return table.cones(judged.settings.lines)
+    return table.cones(judged.settings.of_lines)
 
 
 def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:

@@ -53,12 +53,12 @@ def match_stations(
 ) -> StationMatches | None:
     """Match all detections to stations of closed curves, the cones of the first drive's first lap.
 
-    None if a curve has too few cones, or is a line. A lap misses its beginning by some decimetres, which
-    would smear the cones of both ends and match a later lap to neighbours. So the first lap places the cones,
-    and each stretch of a later lap is shifted along the curves to them. If two shifts are about as likely,
-    the detections of the stretch are not matched.
+    None if a curve has too few cones, or detections are of lines. A lap misses its beginning by some
+    decimetres, which would smear the cones of both ends and match a later lap to neighbours. So the first lap
+    places the cones, and each stretch of a later lap is shifted along the curves to them. If two shifts are
+    about as likely, the detections of the stretch are not matched.
     """
-    if settings.lines:
+    if settings.of_lines:
         return None
     places = {}
     for label in state.boundaries:

@@ -27,7 +27,6 @@ from pathspace_graph.options.data import Convert
 from pathspace_graph.plausibility.diagnosis import measured_line
 from pathspace_graph.plausibility.hint import Hint, because
 from pathspace_graph.plausibility.judge import hints
-from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 
@@ -96,7 +95,7 @@ def _convert(options: Convert, source: Path, out: Path) -> None:
     with progress("converting"):
         record = windowed(_read(options, source, rule), options.window, source)
         recorded = to_log(record, options.frames, options.noise, source, options.window.spacing)
-        log = with_measured_noise(recorded, record.parts)
+        log = with_measured_noise(replace(recorded, scale=options.scale), record.parts)
         write_checked(log, out, source, force=options.force)
     report(record.notes, rule, log)
     tell(_with_units(hints(log)) if options.kind == "csv" else hints(log))
@@ -140,15 +139,15 @@ def with_measured_noise(log: Log, parts: int = 1) -> Log:
         log = replace(log, odometry_sigma=log.odometry_sigma * np.sqrt(parts))
     if log.odometry_stated and log.detections_stated:
         return log
-    scale, settings = scale_of(log), MapperSettings(kind=log.sensor.kind)
-    at_one, samples = scaled(log, 1.0 / scale), TwistRecord()
+    settings = MapperSettings(kind=log.sensor.kind)
+    at_one, samples = log.at_scale_one(), TwistRecord()
     samples.add(Odometry(at_one.odometry.t[::parts], at_one.odometry.twist[::parts]))
     cycles, _ = seen_cycles(at_one, settings)
     measured = measure(cycles, samples, of_lines=settings.kind == "line")
     if measured is None:
         return log
     white = measured.odometry * np.sqrt(parts)
-    measured = scaled(replace(measured, odometry=white, interval=measured.interval / parts), scale)
+    measured = scaled(replace(measured, odometry=white, interval=measured.interval / parts), log.scale)
     sigma = log.odometry_sigma if log.odometry_stated else measured.twist_sigma
     log = replace(log, measured=measured, odometry_sigma=sigma)
     if log.detections_stated:
@@ -175,7 +174,7 @@ def write_checked(log: Log, out: Path, source: Path, *, force: bool) -> None:
 def report(notes: Counter[str], rule: LabelRule, log: Log) -> None:
     """Print the meaning of labels, what was dropped or assumed and how often, and a summary of the log."""
     say(*(f"{count} {text}" for text, count in notes.items() if count))
-    measured = [] if log.measured is None else [measured_line(log.measured, scale_of(log))]
+    measured = [] if log.measured is None else [measured_line(scaled(log.measured, 1.0 / log.scale))]
     labels = [rule.summary()] if rule.met else []
     if hint := rule.hint():
         note(f"hint: {hint}")

@@ -58,14 +58,14 @@ def online_command(options: Online) -> Outcome:
     if options.view or options.save_view is not None:
         viewing = import_module("pathspace_graph.eval.view.recording")
         viewing.check_recording(options.save_view, options.view)
-    log, hints = read_plausible_log(options.log, options.settings.limits)
+    log, hints = read_plausible_log(options.log, options.settings.limits, options.scale)
     tell(hints)
     log, estimator = begin(options, known, log, parameters)
     with (
         nullcontext()
         if viewing is None
         else viewing.recording(
-            options.save_view, window=options.view, settings=options.recording, truth=log.truth
+            options.save_view, window=options.view, settings=options.recording, truth=log.at_scale_one().truth
         ) as recorder
     ):
         observers = [] if recorder is None else [recorder]
@@ -122,7 +122,9 @@ def begin(
         return log, estimators.make_online(options.estimator, options.settings, log, parameters)
     settings = estimators.settings_of(options.settings, log)
     start = known.start if options.start is None else np.array(options.start)
-    mapper = FixedLagMapper.on(known.map, settings, log.noise, start=start, keep=options.keep_map)
+    start = None if start is None else start / np.array([log.scale, log.scale, 1.0])
+    track = scaled(known.map, 1.0 / log.scale)
+    mapper = FixedLagMapper.on(track, settings, log.noise, start=start, keep=options.keep_map)
     return replace(log, truth=None), mapper  # the truth is in another frame
 
 
@@ -134,7 +136,7 @@ def batch_command(options: Batch) -> Outcome:
     parameters = own_parameters(options)
     if len(options.log) > 1:
         return batch_of_several(options)
-    log, hints = read_plausible_log(options.log[0], options.settings.limits)
+    log, hints = read_plausible_log(options.log[0], options.settings.limits, options.scale)
     tell(hints)
     with progress("optimizing") as advance:
         estimator = estimators.make_batch(options.estimator, options.settings, log, parameters)
@@ -154,7 +156,7 @@ def batch_of_several(options: Batch) -> Outcome:
         raise SettingsError(f"{expected}, found {options.estimator}")
     logs, hints = dict[str, Log](), dict[str, list[Hint]]()
     for name, folder in unique_names(options.log).items():
-        logs[name], hints[name] = read_plausible_log(folder, options.settings.limits)
+        logs[name], hints[name] = read_plausible_log(folder, options.settings.limits, options.scale)
         tell(hints[name], of=name)
     with progress("optimizing") as advance:
         joint = solve_together(logs, spline_batch, options.settings, options.start, advance)
@@ -263,19 +265,17 @@ def report(result: RunResult, log: Log) -> None:
         output().print(laps_table(laps))
     begin = float(log.odometry.t[0])  # a bag's stamps count from 1970
     say(outline(result, begin))
-    sides = {"line": "on both sides", "line-left": "on the left", "line-right": "on the right"}
-    kind = result.settings.get("kind", "cones")
-    if kind is None:
-        say("too little was seen twice to tell cones from points of a line: cones are assumed")
-    elif kind in sides:
-        say(f"detections are points of a line {sides[kind]}, not of things that stay")
+    if result.scale != 1.0:
+        say(f"lengths of hints, notices, calibration and noise are in units of {result.scale:g} m")
+    if result.settings.get("kind") == "line":
+        say("detections are points of lines, not of things that stay")
     say(*(f"at {record.t - begin:.1f} s: {record.notice}" for record in result.cycles if record.notice))
     if result.batches is not None and result.batches.late:
         late = f"{result.batches.late} cycle{'' if result.batches.late == 1 else 's'}"
         say(f"in a vehicle the batch of the lap would have been {late} late")
-    state = result.vehicle
-    say(*noise_lines(result.noise, result.scale))
-    say(*([] if state is None else diagnose(state, result.settings, result.scale)))
+    at_one = result.at_scale_one()
+    say(*noise_lines(at_one.noise))
+    say(*([] if at_one.vehicle is None else diagnose(at_one.vehicle, result.settings)))
     if missing := not_mapped(result.map, log):
         note("; ".join(missing))
 

@@ -178,7 +178,7 @@ def to_log(
         odometry,
         cycles,
         np.array(logs.SIGMA_ODOMETRY if noise.sigma_odometry is None else noise.sigma_odometry, dtype=float),
-        sensor=SensorInfo(kind="line" if is_line else None),
+        sensor=SensorInfo(kind="line" if is_line else "cones"),
         source=record.source,
         odometry_stated=noise.sigma_odometry is not None,
         odometry_drift=None if noise.sigma_drift is None else np.array(noise.sigma_drift),

@@ -18,8 +18,7 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
-from .kind import KindJudge
-from .line_matching import merged, of_line
+from .line_matching import merged
 from .log_odometry import LogOdometry, chained
 from .measurement import odometry_of
 from .motion import MotionCheck
@@ -36,9 +35,6 @@ COLOURLESS: Final = {  # notices of the cycle in which most colours become unkno
     True: "most detections have no colour: the driven path determines their sides",
     False: "most detections have a colour again",
 }
-OF_LINES: Final = (
-    "the detections are points of a line but are mapped as cones: start again with the setting `kind` = {!r}"
-)
 NEAREST: Final = 2  # number of nearest cones that must be orange in a lane of orange cones
 
 
@@ -60,28 +56,25 @@ class Reading:
 class FrontEnd(Copyable):
     """Checks of each cycle's readings against the previous cycles, without a map."""
 
-    def __init__(self, settings: MapperSettings, noise: KnownNoise, scale: float = 1.0) -> None:
-        """Start with the noise known at scale 1; lengths of the cycles are divided by `scale`."""
-        self.noise = NoiseLearner(noise, settings.noise, of_lines=settings.kind == "line")
-        self.gate = Gate(settings.limits, scale, of_lines=settings.kind == "line")
-        self._motion = MotionCheck(self.noise.twist, settings.motion)
+    def __init__(self, settings: MapperSettings, noise: KnownNoise) -> None:
+        self.noise = NoiseLearner(noise, settings.noise, of_lines=settings.of_lines)
+        self.gate = Gate(settings.limits, of_lines=settings.of_lines)
+        self._motion = MotionCheck(self.noise.twist, settings.motion, of_lines=settings.of_lines)
         self._settings = settings
         self._begun = self._sensor_doubted = False
         self._sides = SideJudge(settings.sides)
-        self._kind = None if settings.kind else KindJudge()  # until the kind is known
 
     def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
-        """Return the cycle at scale 1; raise a ReadingError if it is unusable."""
+        """Return a usable cycle; raise a ReadingError for any other."""
         return self.gate.admit(odometry, detections, self._motion.newest)
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Check the readings of a cycle: the twists since the previous one, and its detections."""
         noise, check = self.noise, self._motion
-        cones, orange, is_line, in_lane = split_detections(detections, self._settings)
+        cones, orange, in_lane = split_detections(detections, self._settings)
         checked = noise.for_check(cones, odometry.twist[-1] if len(odometry.t) else np.zeros(3))
-        motion = check.update(odometry, checked, noise.is_settled, is_line)
+        motion = check.update(odometry, checked, noise.is_settled)
         cones, notices = self._labelled(cones, checked, motion, in_lane=in_lane)
-        notices += self._found_kind(odometry, cones)
         for_map, orange_for_map = noise.for_map(cones), noise.for_map(orange)
         measured = self._measured(odometry, cones, motion)
         doubted, notice = self._sensor_doubted, "; ".join(notices)
@@ -112,22 +105,12 @@ class FrontEnd(Copyable):
         if may_doubt and check.errors.contradict(calibration):
             self._sensor_doubted = True
             settings = replace(settings, calibration=check.errors.found(calibration))
-        fresh = noise.observe(odometry, measurable(cones, settings), motion, check.pose)
+        fresh = noise.observe(odometry, cones, motion, check.pose)
         if fresh:
             check.set_noise(noise.twist)
         if fresh or not self._begun:
             settings, self._begun = noise.calibrated(self._settings), True
         return None if settings is self._settings else settings
-
-    def _found_kind(self, odometry: Odometry, cones: Detections) -> list[str]:
-        """Return a notice if detections mapped as cones turn out to be points of a line."""
-        if self._kind is None:
-            return []
-        self._kind.see(odometry, cones)
-        if not self._kind.is_final:
-            return []
-        kind, self._kind = self._kind.kind, None
-        return [] if kind in (None, "cones") else [OF_LINES.format(kind)]
 
     @property
     def noise_used(self) -> RunNoise:
@@ -151,7 +134,7 @@ class JudgedLog:
 
 
 def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLog:
-    """Check a log at scale 1 for a batch; unknown noise is measured on the whole log first."""
+    """Check a log for a batch; unknown noise is measured on the whole log first."""
     front_end = FrontEnd(settings, noise)
     if front_end.noise.is_learning:
         front_end = FrontEnd(settings, replace(noise, measured=measure_log(log, settings)))
@@ -165,25 +148,15 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
     return JudgedLog(chain, cycles, orange, settings, front_end.noise_used)
 
 
-def measurable(detections: Detections, settings: MapperSettings) -> Detections:
-    """Return the detections for noise measurement: cones, or points of lines if the log has no cones."""
-    if settings.kind == "line":
-        return detections
-    return detections.where(~of_line(detections.labels, settings))
+def split_detections(detections: Detections, settings: MapperSettings) -> tuple[Detections, Detections, bool]:
+    """Split detections into those of boundaries, points of lines merged, and orange cones.
 
-
-def split_detections(
-    detections: Detections, settings: MapperSettings
-) -> tuple[Detections, Detections, BoolArray, bool]:
-    """Split detections into boundary cones (m) and orange ones.
-
-    The others are whether each boundary cone is a point of a line (m,), and `is_in_orange_lane`.
+    The third value is `is_in_orange_lane`.
     """
     of_orange = is_orange(detections)
     cones = detections.where(~of_orange)
-    cones = merged(cones, of_line(cones.labels, settings))
-    is_line = of_line(cones.labels, settings)
-    return cones, detections.where(of_orange), is_line, is_in_orange_lane(detections, of_orange)
+    cones = merged(cones) if settings.of_lines else cones
+    return cones, detections.where(of_orange), is_in_orange_lane(detections, of_orange)
 
 
 def is_in_orange_lane(detections: Detections, of_orange: BoolArray) -> bool:
@@ -199,12 +172,9 @@ def is_orange(detections: Detections) -> BoolArray:
 
 
 def measure_log(log: Log, settings: MapperSettings | None = None) -> MeasuredNoise | None:
-    """Measure the noise of a whole log and the constant errors of its sensor from its readings alone.
-
-    `settings.kind` and `settings.lines` select the detections that are points of lines.
-    """
+    """Measure the noise of a whole log and the constant errors of its sensor from its readings alone."""
     settings = settings or MapperSettings()
-    return measure(*seen_cycles(log, settings), of_lines=settings.kind == "line")
+    return measure(*seen_cycles(log, settings), of_lines=settings.of_lines)
 
 
 def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[SeenCycle], TwistRecord]:
@@ -215,12 +185,14 @@ def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[
         twists.add(odometry)
     white = odometry_of(twists, None)
     check, sides = (
-        MotionCheck(log.noise.twist if white is None else white.twist, settings.motion),
+        MotionCheck(
+            log.noise.twist if white is None else white.twist, settings.motion, of_lines=settings.of_lines
+        ),
         SideJudge(settings.sides),
     )
     for odometry, detections in readings:
-        cones, _, is_line, in_lane = split_detections(detections, settings)
-        motion = check.update(odometry, cones, may_doubt=None, is_line=is_line)
+        cones, _, in_lane = split_detections(detections, settings)
+        motion = check.update(odometry, cones, may_doubt=None)
         labelled = sides.update(check.pose, motion.twists, cones, in_lane=in_lane)
-        cycles.append(SeenCycle(measurable(labelled, settings), check.pose, motion.odometry.twist))
+        cycles.append(SeenCycle(labelled, check.pose, motion.odometry.twist))
     return cycles, twists

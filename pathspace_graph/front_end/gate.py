@@ -1,8 +1,7 @@
 """The gate of the online estimators: it checks a perception cycle before the estimate changes.
 
 A wrong stamp, shape, label or twist makes the whole cycle unusable: a ReadingError is raised and nothing
-changes. An impossible detection is dropped, since a detector may fail for a single cone. The gate divides
-lengths by the scale of the scene, and `Admitted.counted` multiplies those of the result by it.
+changes. An impossible detection is dropped, since a detector may fail for a single cone.
 """
 
 from dataclasses import dataclass, replace
@@ -27,12 +26,8 @@ from pathspace_graph.io.log import (
     Odometry,
 )
 from pathspace_graph.labels import LEFT, NAMES
-from pathspace_graph.lengths import joined, scaled
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.online import LimitSettings
-
-from .kind import kind_of
 
 TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
 LATEST_STAMP: Final = 1e11  # largest stamp (s), 3000 years: stamps in nanoseconds are larger
@@ -59,38 +54,35 @@ class Newest:
 
 @dataclass(frozen=True, eq=False)
 class Admitted:
-    """A usable perception cycle, at scale 1 and in arrays of its own."""
+    """A usable perception cycle, in arrays of its own."""
 
     odometry: Odometry  # twists in force from the newest cycle to this one
     detections: Detections  # possible detections
     dropped: int = 0  # number of impossible detections
     refused: int = 0  # number of cycles refused since the last admitted one
     notice: str = ""  # reason for dropping, in the first of successive cycles with dropped detections
-    scale: float = 1.0  # scale of the scene
 
     def counted(self, result: CycleResult) -> CycleResult:
-        """Return the result of the cycle in metres of its scene, with the counts of the gate."""
-        result = scaled(result, self.scale)
+        """Return the result of the cycle with the counts of the gate."""
         if not (self.dropped or self.refused):
             return result
-        notice = joined([self.notice, result.notice])
+        notice = "; ".join(filter(None, [self.notice, result.notice]))
         return replace(result, notice=notice, dropped=self.dropped, refused=self.refused)
 
 
 class Gate(Copyable):
     """Checks of each cycle, and the number of refused cycles."""
 
-    def __init__(self, limits: LimitSettings, scale: float = 1.0, *, of_lines: bool = False) -> None:
-        """Take limits at scale 1, the scene's scale, and whether all detections are points of lines."""
-        self.scale = scale
+    def __init__(self, limits: LimitSettings, *, of_lines: bool = False) -> None:
+        """Take limits, and whether all detections are points of lines."""
         self._most = MOST_POINTS if of_lines else MOST_DETECTIONS
-        self.limits = scaled(limits, scale)  # in metres of the scene
+        self.limits = limits
         self.refused = 0  # number of cycles refused since the last admitted one
         self._refused_at: float | None = None  # stamp (s) of the previous cycle, if it was refused
         self._dropping = False  # whether the previous cycle had impossible detections
 
     def admit(self, odometry: Odometry, detections: Detections, newest: Newest) -> Admitted:
-        """Return a usable cycle at scale 1; otherwise raise a ReadingError and count it as refused.
+        """Return a usable cycle; otherwise raise a ReadingError and count it as refused.
 
         Each twist is held until the next one. Twists that end before the newest cycle are left out.
         """
@@ -102,16 +94,15 @@ class Gate(Copyable):
             silence = inf  # it follows the cycle just refused: two consistent cycles end a silence
         t = _stamp(_of_type(Detections, detections, "detections").t)
         try:
-            possible, notice = possible_detections(detections, t, self.limits, self.scale, self._most)
+            possible, notice = possible_detections(detections, t, self.limits, self._most)
             stamps, twists = _checked_twists(_of_type(Odometry, odometry, "odometry"), self.limits)
             _check_order(stamps, t, newest.t, silence)
         except ReadingError as error:
             raise error.at(t) from None
         dropped, notice = len(detections.labels) - len(possible.labels), "" if self._dropping else notice
         self.refused, self._refused_at, self._dropping = 0, None, dropped > 0
-        to_one = 1.0 / self.scale
-        since = _since(scaled(Odometry(stamps, twists), to_one), newest)
-        return Admitted(since, scaled(thinned(possible), to_one), dropped, refused, notice, self.scale)
+        since = _since(Odometry(stamps, twists), newest)
+        return Admitted(since, thinned(possible), dropped, refused, notice)
 
     def refuse(self) -> None:
         self.refused += 1
@@ -119,8 +110,8 @@ class Gate(Copyable):
 
 def check_usable(log: Log, folder: Path, limits: LimitSettings) -> None:
     """Raise an InputError of the log in a folder, with row and stamp, where a cycle is unusable."""
-    gate, newest = Gate(limits, scale_of(log), of_lines=kind_of(log) == "line"), Newest()
-    for odometry, detections in split_odometry(log):
+    gate, newest = Gate(limits, of_lines=log.sensor.kind == "line"), Newest()
+    for odometry, detections in split_odometry(log.at_scale_one()):
         try:
             admitted = gate.admit(odometry, detections, newest)
         except ReadingError as error:
@@ -209,11 +200,11 @@ def _since(odometry: Odometry, newest: Newest) -> Odometry:
 
 
 def possible_detections(
-    detections: Detections, t: float, limits: LimitSettings, scale: float, most: int = MOST_DETECTIONS
+    detections: Detections, t: float, limits: LimitSettings, most: int = MOST_DETECTIONS
 ) -> tuple[Detections, str]:
     """Return the possible detections of a cycle at t (s), and a notice about the others.
 
-    Detections and limits are in metres of a scene of this scale. More than `most` are refused.
+    More than `most` are refused.
     """
     points = _numbers(detections.points_vehicle, "detections.points_vehicle", (-1, 2))
     count = len(points)
@@ -221,7 +212,7 @@ def possible_detections(
     labels = _labels(detections.labels, count)
     if count > most:
         raise ReadingError("detections.points_vehicle", f"at most {most} rows", count)
-    ranges, sigmas = (MIN_RANGE * scale, limits.range_max), (MIN_SIGMA * scale, MAX_SIGMA * scale)
+    ranges, sigmas = (MIN_RANGE, limits.range_max), (MIN_SIGMA, MAX_SIGMA)
     near, definite = kernels.usable(points, covariances, (*ranges, MOST_ASYMMETRY, MIN_DETERMINANT, *sigmas))
     good = near & definite
     if good.all():

@@ -1,4 +1,4 @@
-"""Points of a line: which detections they are, and scan matching that draws them to the line beside them.
+"""Points of lines: scan matching that draws them to the line beside them.
 
 The line is that of the recent points about a detection: their weighted mean, and the direction in which they
 are spread most. Only the distance across it counts, so what a line cannot tell, the way along it, stays open.
@@ -10,12 +10,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.se2 import left_of, rotation, to_map
 from pathspace_graph.io.log import Detections
-from pathspace_graph.settings.mapper import MapperSettings
 
 MOST_DOUBLINGS: Final = 1 << 6  # of the side of a cell
 MOST_CELLS: Final = 1 << 20  # in a row of cells, which is more than any sensor sees
@@ -37,18 +35,8 @@ along the lines, and they are taken for straight."""
 HEADING_TOLD: Final = 0.05  # standard deviation of the heading (rad) up to which lines hold the pose
 
 
-def of_line(labels: IntArray, settings: MapperSettings) -> BoolArray:
-    """Return which detections (m,) are points of a line: all where both sides are, whatever the label."""
-    if settings.kind == "line":
-        return np.ones(len(labels), bool)
-    return np.isin(labels, settings.lines) if settings.lines else np.zeros(len(labels), bool)
-
-
-def merged(detections: Detections, is_line: BoolArray) -> Detections:
-    """Return detections with the points of a line that share label and cell replaced by their mean."""
-    if not is_line.any():
-        return detections
-    line = detections.where(is_line)
+def merged(line: Detections) -> Detections:
+    """Return the means of the points of lines that share label and cell."""
     doublings = np.maximum(np.frexp(np.hypot(*line.points_vehicle.T) / MERGE_RANGE)[1], 0)
     side = np.ldexp(MERGE_CELL, doublings)
     column, row = np.floor(line.points_vehicle.T / side).astype(np.intp)
@@ -56,8 +44,7 @@ def merged(detections: Detections, is_line: BoolArray) -> Detections:
     _, first, cell, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
     points = _means(line.points_vehicle, cell, counts)
     covariances = _means(line.covariances.reshape(-1, 4), cell, counts) / counts[:, None]
-    mean = Detections(line.t, points, covariances.reshape(-1, 2, 2), line.labels[first])
-    return detections.where(~is_line).with_others(mean)
+    return Detections(line.t, points, covariances.reshape(-1, 2, 2), line.labels[first])
 
 
 def _means(values: Array, cell: IntArray, counts: IntArray) -> Array:
@@ -69,29 +56,27 @@ class Seen(NamedTuple):
 
     points: Array  # (m, 2) corrected, vehicle frame (m)
     variances: Array  # (m,) of one coordinate (m^2)
-    is_line: BoolArray  # (m,) whether they are points of a line
 
     def where(self, chosen: BoolArray) -> "Seen":
-        return Seen(self.points[chosen], self.variances[chosen], self.is_line[chosen])
+        return Seen(self.points[chosen], self.variances[chosen])
 
 
 class Limits(NamedTuple):
     """Limits of a match, as `scan_matching` has them for cones."""
 
     farthest: float  # distance in reaches from which on a remembered detection has no weight
-    weight: float  # least sum of weights of a matched detection that is a cone
     huber: float  # whitened distance beyond which a weight is reduced
     sigma: float  # added to a detection's (m)
     fewest: int  # least number of matched detections that tell a motion
 
 
 class Targets(NamedTuple):
-    """What placed detections are drawn to."""
+    """Lines beside placed detections."""
 
     off: Array  # (m, 2) from the mean of the recent points to each detection (m)
     weights: Array  # (m,) sums of the weights of these points
-    normals: Array  # (m, 2) unit vectors across the line; zero for cones
-    matched: BoolArray  # (m,) whether there is a line, or a cone
+    normals: Array  # (m, 2) unit vectors across the line
+    matched: BoolArray  # (m,) whether there is a line
 
 
 def targets_on_lines(placed: Array, recent: Array, reach: float, farthest: float) -> Targets:
@@ -118,10 +103,9 @@ def targets_on_lines(placed: Array, recent: Array, reach: float, farthest: float
 
 @dataclass(frozen=True, eq=False)
 class LineMatch:
-    """Detections of a cycle beside recent ones, of cones and of lines."""
+    """Points of a cycle beside recent ones."""
 
-    cones: Array  # (n, 2) recent points of cones (m)
-    lines: Array  # (k, 2) recent points of lines (m)
+    recent: Array  # (k, 2) recent points (m)
     seen: Seen
     limits: Limits
 
@@ -148,40 +132,21 @@ class LineMatch:
         targets, _, squares = self._misfit(pose, reach)
         return squares, targets.matched
 
-    def _targets(self, pose: Array, reach: float) -> Targets:
-        is_line, limits = self.seen.is_line, self.limits
-        placed = to_map(self.seen.points, pose[None])
-        found = Targets(
-            np.zeros(placed.shape), np.ones(len(placed)), np.zeros(placed.shape), np.zeros(len(placed), bool)
-        )
-        if len(self.cones) and not is_line.all():
-            alone = placed[~is_line]
-            means, weights = kernels.weighted_means(alone, self.cones, reach, limits.farthest)
-            found.off[~is_line], found.weights[~is_line] = alone - means, weights
-            found.matched[~is_line] = np.asarray(weights) > limits.weight
-        if len(self.lines) and is_line.any():
-            own = targets_on_lines(placed[is_line], self.lines, LINE_REACH * reach, limits.farthest)
-            for column, values in zip(found, own, strict=True):
-                column[is_line] = values
-        return found
-
     def _misfit(self, pose: Array, reach: float) -> tuple[Targets, Array, Array]:
         """Targets at a pose (3,), and variances and whitened squares (m,) of the detections."""
-        targets = self._targets(pose, reach)
+        placed = to_map(self.seen.points, pose[None])
+        targets = targets_on_lines(placed, self.recent, LINE_REACH * reach, self.limits.farthest)
         weights = np.where(targets.matched, targets.weights, 1.0)
         variances = self.seen.variances * (1.0 + 1.0 / weights) + self.limits.sigma**2
-        is_line = targets.normals.any(axis=1)
-        across = (targets.off * targets.normals).sum(axis=1) ** 2
-        squares = np.where(is_line, across, (targets.off**2).sum(axis=1)) / variances
+        squares = (targets.off * targets.normals).sum(axis=1) ** 2 / variances
         return targets, np.asarray(variances), np.asarray(squares)
 
     def _system(self, pose: Array, reach: float) -> tuple[Array, Array, BoolArray, float]:
         """Hessian (3, 3) and gradient (3,) of half the sum of squares, which are matched, and the sum."""
         targets, variances, square = self._misfit(pose, reach)
         weights = huber_weights(np.sqrt(square), self.limits.huber) * targets.matched / variances
-        n, is_line = targets.normals, targets.normals.any(axis=1)
-        axes = np.where(np.asarray(is_line)[:, None, None], n[:, :, None] * n[:, None, :], np.eye(2))
-        information = axes * weights[:, None, None]
+        n = targets.normals
+        information = n[:, :, None] * n[:, None, :] * weights[:, None, None]
         arm = left_of(to_map(self.seen.points, pose[None]) - pose[:2])
         jacobian = np.concatenate([np.tile(np.eye(2), (len(arm), 1, 1)), arm[:, :, None]], axis=2)
         weighted = information @ jacobian

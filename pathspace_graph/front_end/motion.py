@@ -44,13 +44,13 @@ class MotionCheck(Copyable):
     Poses are in the frame of dead reckoning, which drifts; only the newest ones are used.
     """
 
-    def __init__(self, noise: TwistNoise, settings: MotionSettings) -> None:
+    def __init__(self, noise: TwistNoise, settings: MotionSettings, *, of_lines: bool = False) -> None:
         self.noise = noise
         self.seen_again: BoolArray = np.zeros(0, bool)  # (m,) `Reading.seen_again` of the newest cycle
         self.pose: Array = np.zeros(3)  # (3,) newest pose by dead reckoning; the first one is 0
         self._settings = settings
         self._twists = HeldTwists(settings)
-        self._matcher = ScanMatcher(settings)
+        self._matcher, self._of_lines = ScanMatcher(settings, of_lines=of_lines), of_lines
         self._rest = Rest()
         self._standstill = Standstill()
         self._velocity: Array | None = None
@@ -68,22 +68,19 @@ class MotionCheck(Copyable):
         odometry: Odometry,
         detections: Detections,
         may_doubt: bool | None = True,
-        is_line: BoolArray | None = None,
     ) -> MeasuredMotion:
         """Return the motion since the previous cycle.
 
         Detections may contradict the odometry if `may_doubt`. If that is None, they are matched only where
-        the odometry is missing or stuck. Points of a line (`is_line` (m,)) cannot show a standstill.
+        the odometry is missing or stuck. Points of lines cannot show a standstill.
         """
-        is_line = np.zeros(len(detections.labels), bool) if is_line is None else is_line
         t, matcher = detections.t, self._matcher
         motion = self._twists.integrate(odometry, t, self._t, self.noise)
         twist, delta = motion.odometry.twist, motion.odometry.delta
-        seen = matcher.corrected(detections, twist, is_line)
+        seen = matcher.corrected(detections, twist)
         limit = GATE_DISTRUSTED if t - self._doubted_at < DISTRUST else self._settings.doubt
-        if may_doubt is not None:
-            cones = matcher.excess * detections.covariances[~is_line]
-            self._standstill.add(t, seen.points[~is_line], cones, delta)
+        if may_doubt is not None and not self._of_lines:
+            self._standstill.add(t, seen.points, matcher.excess * detections.covariances, delta)
         standing, agrees = self._standing(motion) if may_doubt else None, None
         if standing is None:
             motion, agrees = self._checked(motion, t, seen, may_doubt, limit)
@@ -102,7 +99,7 @@ class MotionCheck(Copyable):
         elif may_doubt is not None:
             self.seen_again = matcher.has(seen, self.pose)
         moving = motion.odometry.twist if motion.fault else twist
-        matcher.remember(detections, moving, self.pose, is_line)
+        matcher.remember(detections, moving, self.pose)
         self._standstill.believe(self.pose)
         if self._t is not None and t > self._t:
             self._velocity = motion.odometry.delta / (t - self._t)

@@ -103,7 +103,7 @@ class Match:
     information: Array  # (3, 3) information about the pose from the matched detections, same frame
     is_matched: BoolArray  # (m,) whether each detection coincides with earlier ones
     misfit: float  # mean square of the matched detections' whitened distances
-    by_lines: bool = False  # whether points of lines are among them
+    by_lines: bool = False  # whether they are points of lines
 
     @property
     def matched(self) -> int:
@@ -144,7 +144,7 @@ def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array,
     return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
 
 
-MATCH_LIMITS: Final = Limits(FARTHEST, MIN_WEIGHT, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED)
+MATCH_LIMITS: Final = Limits(FARTHEST, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED)
 
 
 # --- errors of the sensor --------------------------------------------------------------------------------
@@ -233,52 +233,50 @@ class SensorErrors(Copyable):
 class ScanMatcher(Copyable):
     """Matching of each cycle with the previous ones, and sensor errors and noise learned from it."""
 
-    def __init__(self, settings: MotionSettings) -> None:
-        self._settings = settings
+    def __init__(self, settings: MotionSettings, *, of_lines: bool = False) -> None:
+        self._settings, self._of_lines = settings, of_lines
         self._misfit = 1.0  # mean of those of the matches that agreed, the newest counting most
         self.forget()
 
     def forget(self) -> None:
         """Forget the remembered cycles and the learned sensor errors."""
         self.recent, self.errors = RecentDetections(), SensorErrors(self._settings)
-        self.recent_lines = RecentDetections()
 
     @property
     def excess(self) -> float:
         """Ratio of the actual variance of detections to the claimed one; at least 1."""
         return max(self._misfit / LARGE_MISFIT, 1.0)
 
-    def corrected(self, detections: Detections, twist: Array, is_line: BoolArray) -> Seen:
+    def corrected(self, detections: Detections, twist: Array) -> Seen:
         """Correct a cycle's detections, and the remembered ones, for the sensor errors."""
         measured, covariances = detections.points_vehicle, detections.covariances
-        for recent in (self.recent, self.recent_lines):
-            if len(recent.points):
-                recent.forget(detections.t)
-                recent.correct(self.errors.mean)
+        if len(self.recent.points):
+            self.recent.forget(detections.t)
+            self.recent.correct(self.errors.mean)
         points = measured + by_errors(measured, twist) @ self.errors.mean
-        return Seen(points, 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1]), is_line)
+        return Seen(points, 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1]))
 
-    def remember(self, detections: Detections, twist: Array, pose: Array, is_line: BoolArray) -> None:
+    def remember(self, detections: Detections, twist: Array, pose: Array) -> None:
         """Remember the detections of a cycle with a pose (3,) and a twist (3,)."""
         measured = detections.points_vehicle
-        columns, lines = by_errors(measured, twist), np.flatnonzero(is_line)
-        lines = lines[:: max(-(-len(lines) // LINE_REMEMBERED), 1)]
-        for recent, rows in ((self.recent, np.flatnonzero(~is_line)), (self.recent_lines, lines)):
-            if len(rows):
-                recent.add(detections.t, measured[rows], columns[rows], pose)
+        columns, every = by_errors(measured, twist), 1
+        if self._of_lines:
+            every = max(-(-len(measured) // LINE_REMEMBERED), 1)
+        if len(measured):
+            self.recent.add(detections.t, measured[::every], columns[::every], pose)
 
     def has(self, seen: Seen, pose: Array) -> BoolArray:
         """Whether each detection (m,), seen from a pose (3,), coincides with earlier ones."""
-        placed, again = to_map(seen.points, pose[None]), np.zeros(len(seen.points), bool)
-        again[~seen.is_line] = self.recent.has(placed[~seen.is_line])
-        lines = self.recent_lines.points
-        if len(lines) and seen.is_line.any():
-            again[seen.is_line] = KDTree(lines).query(placed[seen.is_line])[0] < REACH_FIRST
-        return again
+        placed = to_map(seen.points, pose[None])
+        if self._of_lines and len(self.recent.points):
+            return np.asarray(KDTree(self.recent.points).query(placed)[0] < REACH_FIRST)
+        return self.recent.has(placed)
 
     def match(self, seen: Seen, start: Array, reaches: Sequence[float]) -> Match | None:
         """Return the match of detections from an initial pose (3,); None if the pose is not observable."""
-        if seen.is_line.any():
+        if not (len(self.recent.points) and len(seen.points)):
+            return None
+        if self._of_lines:
             pose, information, chosen, square = self._beside(seen).found(start, reaches)
             misfit = square / max(int(chosen.sum()), 1)
             matched = Match(pose, information, chosen, misfit, by_lines=True)
@@ -289,8 +287,7 @@ class ScanMatcher(Copyable):
     def difference(self, matched: Match, odometry: IntegratedOdometry, predicted: Array) -> Difference:
         """Return the difference of a match from the pose (3,) predicted by odometry, in the vehicle frame."""
         known = matched.pose, matched.information, self.excess, predicted, odometry.covariance
-        recent = self.recent_lines if matched.by_lines else self.recent
-        way = rotation(predicted[2]).T @ (predicted[:2] - recent.seen_from)
+        way = rotation(predicted[2]).T @ (predicted[:2] - self.recent.seen_from)
         return Difference(*kernels.off_prediction(*known), self.errors.shifts(way, odometry.twist))
 
     def denies(self, matched: Match, difference: Difference, limit: float) -> bool:
@@ -324,4 +321,4 @@ class ScanMatcher(Copyable):
         return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
 
     def _beside(self, seen: Seen) -> LineMatch:
-        return LineMatch(self.recent.points, self.recent_lines.points, seen, MATCH_LIMITS)
+        return LineMatch(self.recent.points, seen, MATCH_LIMITS)

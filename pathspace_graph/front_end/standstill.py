@@ -66,6 +66,8 @@ class Standstill(Copyable):
         exceeds `limit^2`, standstill is likelier than slip, and the gain exceeds its scatter. All of these
         cycles then get the pose of the first one.
         """
+        if not self._cycles:
+            return None
         earlier = len(self._cycles) - 1
         sums = np.zeros((len(HYPOTHESES) + 1, earlier))
         for k, one in enumerate(self._cycles):

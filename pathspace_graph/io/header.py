@@ -82,6 +82,7 @@ class Header(Struct):
     """A header as it was read, without format."""
 
     odometry: _Odometry
+    scale: Positive = 1.0
     sensor: _Sensor = _Sensor()
     noise: _Noise = _Noise()
     source: dict[str, Any] = {}
@@ -152,8 +153,9 @@ def noise_sections(odometry: bool, detections: bool, measured: MeasuredNoise | N
     return {"noise": section, "noise.measured": {name: values[name] for name in names}}
 
 
-def to_toml(sections: Mapping[str, Mapping[str, Any]]) -> str:
+def to_toml(sections: Mapping[str, Mapping[str, Any]], scale: float = 1.0) -> str:
     lines = [f'format = "{FORMAT}"']
+    lines += [] if scale == 1.0 else [f"scale = {toml_text(scale)}"]
     for name, entries in sections.items():
         lines += ["", f"[{name}]"]
         lines += [f"{key} = {toml_text(value)}" for key, value in entries.items() if value is not None]

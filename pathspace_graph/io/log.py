@@ -15,7 +15,7 @@ from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, UNKNOWN, Kind, label_from_name
-from pathspace_graph.lengths import POSE_LENGTHS
+from pathspace_graph.lengths import POSE_LENGTHS, scaled
 
 from . import parsing as limits
 from .brief import Brief, pictures
@@ -170,6 +170,7 @@ class Log:
     LENGTHS: ClassVar = {
         **dict.fromkeys(("odometry", "cycles", "sensor", "measured", "truth"), 0),
         **dict.fromkeys(("odometry_sigma", "odometry_drift"), POSE_LENGTHS),
+        "scale": 1,
     }
 
     odometry: Odometry
@@ -190,6 +191,8 @@ class Log:
     measured: MeasuredNoise | None = None
     """Noise and constant errors of the sensor, as the readings themselves show them."""
     truth: Truth | None = None
+    scale: float = 1.0
+    """Size of the scene by that of a Formula Student track: 0.1 for a model car of 1:10, 3 for a road."""
 
     def __repr__(self) -> str:
         t, noise = self.odometry.t, ("their noise measured", "their noise stated")
@@ -243,11 +246,16 @@ class Log:
             odometry_drift=None if odometry_drift is None else np.array(odometry_drift, float),
         )
 
+    def at_scale_one(self) -> Log:
+        """Divide all lengths by the scale of the scene."""
+        return scaled(self, 1.0 / self.scale)
+
     @property
     def noise(self) -> KnownNoise:
+        """Return the noise as an estimator takes it, divided by the scale of the scene."""
         stated = self.odometry_stated, self.detections_stated
         scale, drift = self.sensor.sigma_range_scale, self.odometry_drift
-        return KnownNoise(self.odometry_sigma, *stated, self.measured, scale, drift)
+        return scaled(KnownNoise(self.odometry_sigma, *stated, self.measured, scale, drift), 1.0 / self.scale)
 
 
 def _of_arrays(name: str, *values: ArrayLike) -> Table:

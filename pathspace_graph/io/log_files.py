@@ -52,6 +52,7 @@ def read_log(folder: Path | str) -> Log:
         odometry_drift=None if (drift := header.odometry.drift_sigmas) is None else np.array(drift),
         measured=headers.measured_noise(header, file),
         truth=_read_truth(folder, len(table), headers.true_errors(header, file)),
+        scale=header.scale,
     )
 
 
@@ -90,7 +91,8 @@ def write_log(log: Log, folder: Path | str, *, check: bool = False, force: bool 
     """
     check_type("log", log, Log)
     with atomic_folder(folder, LOG_FILE, force=force) as target:
-        (target / LOG_FILE).write_text(headers.to_toml(_sections(log)), encoding="utf-8", newline="\n")
+        header = headers.to_toml(_sections(log), log.scale)
+        (target / LOG_FILE).write_text(header, encoding="utf-8", newline="\n")
         for name, values in _columns(log).items():
             write_table(target / name, COLUMNS[name], *values)
         if check:

@@ -54,7 +54,7 @@ CYCLE_COLUMNS: Final = {  # columns of `cycles.csv` with their types; any furthe
 class CycleRecord:
     """One row of `cycles.csv` (FORMATS)."""
 
-    LENGTHS: ClassVar = {"jump": POSE_LENGTHS, "notice": 0, "reason": 0}
+    LENGTHS: ClassVar = {"jump": POSE_LENGTHS}
 
     cycle: int
     """Number of the perception cycle, from 0."""

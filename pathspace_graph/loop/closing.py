@@ -87,8 +87,6 @@ def make_periodic(
     control_points: Array,
     settings: MapperSettings,
     knots: Knots,
-    *,
-    is_line: bool = False,
 ) -> PeriodicCurve:
     """Fit a periodic curve to an open one with control points (n, 2).
 
@@ -96,7 +94,7 @@ def make_periodic(
     """
     spline, overlap = boundary.spline(control_points), find_overlap(boundary, control_points)
     period, u = overlap.period, boundary.cone_parameters
-    u = np.arange(0.0, period, LINE_STEP) if is_line else u
+    u = np.arange(0.0, period, LINE_STEP) if settings.of_lines else u
     u = _apart(u[u < period - SEAM_MARGIN], settings.growth.merge_radius)
     size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
     if knots == "curvature" or size >= len(u):
@@ -143,9 +141,9 @@ def find_overlap(boundary: Boundary, control_points: Array) -> Overlap:
 def simplify(smoother: CurveSmoother) -> None:
     """Replace every open curve by a periodic one of its final size, and step to the new optimum."""
     state, settings = smoother.map.state, smoother.map.settings
-    knots, lines = settings.spline.knots, settings.lines
+    knots = settings.spline.knots
     periodic = {
-        label: make_periodic(boundary, state.control_points(label), settings, knots, is_line=label in lines)
+        label: make_periodic(boundary, state.control_points(label), settings, knots)
         for label, boundary in state.boundaries.items()
     }
     substitute(smoother, periodic)

@@ -149,7 +149,7 @@ class DriveRecord(Copyable):
             table = DetectionColumns.of([one.seen.with_others(one.orange) for one in chosen], twists=twists)
             table = replace(_for_map(table, noise), cycle=cycles[table.cycle])
             table.correct(sensor)
-            return table.cones(self.settings.lines)
+            return table.cones(self.settings.of_lines)
 
         return seen_in
 

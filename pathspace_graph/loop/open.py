@@ -7,7 +7,6 @@ from pathspace_graph.batch.association import LINE_STEP
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.changes import solve_loop
 from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.lengths import joined
 from pathspace_graph.mapping.registration import RefinedMotion
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.settings.mapper import MapperSettings
@@ -42,7 +41,7 @@ class Open(Phase):
         learned = drive.inflate_priors(road, reading)
         drive.record.estimated(road)
         step = Step(self) if drive.rests(road) else self._step(road, drive, reading, spent)
-        return replace(step, notice=joined([step.notice, learned]))
+        return replace(step, notice="; ".join(filter(None, [step.notice, learned])))
 
     def _step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
         if not drive.solver.is_busy:
@@ -76,8 +75,8 @@ class Open(Phase):
     def _is_solvable(self, road: Road, drive: Drive) -> bool:
         """Whether a batch can solve the lap; one with too many cones is given up."""
         cones = sum(  # or equivalent places on a line
-            boundary.length / LINE_STEP if label in self.settings.lines else len(boundary.cone_parameters)
-            for label, boundary in road.boundaries.items()
+            boundary.length / LINE_STEP if self.settings.of_lines else len(boundary.cone_parameters)
+            for boundary in road.boundaries.values()
         )
         if cones > self.settings.open_lap.max_cones:
             drive.record.give_up("the lap has too many cones for a batch")
@@ -91,9 +90,9 @@ class Open(Phase):
             if outcome.is_final:
                 drive.record.give_up(outcome.reason)
                 self.returns.rest(road, 0.0)  # a registration may close the loop at once
-            return Step(self, notice=joined([STAYS_OPEN, outcome.reason], ": "))
+            return Step(self, notice=f"{STAYS_OPEN}: {outcome.reason}")
         if outcome.objection:
-            return Step(self, notice=joined([STAYS_OPEN, outcome.objection], ": "))
+            return Step(self, notice=f"{STAYS_OPEN}: {outcome.objection}")
         road.smoother.settle()
         jump = drive.close(road, outcome, self.returned_by)
         return Step(self.CLOSED(road, drive), jump)

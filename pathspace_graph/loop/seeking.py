@@ -11,7 +11,6 @@ from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.health import DEGRADED, GOOD, Health
 from pathspace_graph.io.map import Map
-from pathspace_graph.lengths import joined
 from pathspace_graph.mapping.constellation import LAID_NEWEST, Constellation, Expected, lay
 from pathspace_graph.mapping.registration import Motion, RefinedMotion
 from pathspace_graph.mapping.road import Classified, Road
@@ -45,7 +44,7 @@ class Seeking(Phase):
     def __init__(
         self, settings: MapperSettings, track: Map, start: Array | None = None, keep: bool = False
     ) -> None:
-        self.known = known = KnownMap.of(track, keep, settings.lines)
+        self.known = known = KnownMap.of(track, keep, settings.of_lines)
         self.start = start  # (3,) start pose of the drive on the known map, if given
         self.own: Phase = Open(settings)
         self._known = known.smoother(settings)
@@ -75,7 +74,7 @@ class Seeking(Phase):
             return Step(self, step.jump, step.notice, step.health)
         jump = drive.lay_on_known(road, self.known, *place)
         phase = Closed(road, drive) if self.known.closed else OnOpenMap()
-        return Step(phase, jump, joined([step.notice, PLACED]), Health(DEGRADED, PLACED))
+        return Step(phase, jump, "; ".join(filter(None, [step.notice, PLACED])), Health(DEGRADED, PLACED))
 
     def _place(self, road: Road, drive: Drive, reading: Reading) -> tuple[Motion, Array] | None:
         """Return the motion onto the known map, and the covariance (3, 3) of the newest pose there.

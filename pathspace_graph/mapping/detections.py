@@ -113,9 +113,9 @@ class DetectionColumns:
         """Set the calibration of the sensor that corrects `point`."""
         self.sensor = sensor.copy()
 
-    def cones(self, lines: Sequence[int]) -> Self:
-        """Select the detections of cones: all but those of boundaries that are `lines`, by label."""
-        return self.where(np.flatnonzero(~np.isin(self.label, lines))) if lines else self
+    def cones(self, of_lines: bool) -> Self:
+        """Select the detections of cones: all, or none of a table of points of lines."""
+        return self.where(np.zeros(0, np.intp)) if of_lines else self
 
     @property
     def point(self) -> Array:

@@ -10,7 +10,6 @@ from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.labels import BOUNDARIES, NAMES, UNKNOWN
-from pathspace_graph.lengths import Length, Text, joined
 from pathspace_graph.mapping import path
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import SIDES, Candidates, End, PathAhead, chain, crosses
@@ -66,7 +65,7 @@ class Growth:
             ):
                 grown.add(label)
         stopped = sorted(self._full - full)
-        return frozenset(grown), joined(_stopped(smoother.map, label) for label in stopped)
+        return frozenset(grown), "; ".join(_stopped(smoother.map, label) for label in stopped)
 
     def wait_for(self, ends: Mapping[int, float]) -> None:
         """Let known curves grow only when the vehicle is near their ends (m), by label."""
@@ -264,15 +263,11 @@ def end_of(state: State, label: int, path_ahead: PathAhead, behind: float) -> En
     return End(position[0], float(station[0]), side)
 
 
-def _stopped(track: CurveMap, label: int) -> Text:
+def _stopped(track: CurveMap, label: int) -> str:
     """Notice of a boundary that has just stopped growing."""
     boundary = track.state.boundaries[label]
-    return Text(
-        "the open {name} boundary grows no further, with {size} control points on {length:.3g} m",
-        name=NAMES[label],
-        size=boundary.size,
-        length=Length(boundary.confirmed_end),
-    )
+    size, length = boundary.size, boundary.confirmed_end
+    return f"the open {NAMES[label]} boundary grows no further, with {size} control points on {length:.3g} m"
 
 
 def undisputed(track: CurveMap, label: int, points: Array, radius: float) -> BoolArray:

@@ -15,7 +15,6 @@ from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, pose_ke
 from pathspace_graph.graph.window import MapRows, SmootherSettings
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.lengths import scaled
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 from pathspace_graph.settings.online import OdometrySettings
 
@@ -73,17 +72,17 @@ class MeasuredMotion:
         return "the detections contradict the odometry" if self.doubted else ""
 
 
-def known_noise(sigma: Array | KnownNoise | None, scale: float = 1.0) -> KnownNoise:
-    """Noise as known before a drive, at scale 1; by default the simulator's, not stated.
+def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:
+    """Noise as known before a drive; by default the simulator's, not stated.
 
-    `sigma` is in metres of a scene of the given scale. An array (3,) states the standard deviations of a
-    twist (m/s, m/s, rad/s). SettingsError for anything but three positive numbers.
+    An array (3,) states the standard deviations of a twist (m/s, m/s, rad/s). SettingsError for anything but
+    three positive numbers.
     """
     if sigma is None:
         return KnownNoise(np.array(ODOMETRY_SIGMA), odometry_stated=False)
     if not isinstance(sigma, KnownNoise):
         sigma = KnownNoise(sigma)
-    return scaled(replace(sigma, odometry=_positive_sigmas(sigma.odometry)), 1.0 / scale)
+    return replace(sigma, odometry=_positive_sigmas(sigma.odometry))
 
 
 def _positive_sigmas(values: Any) -> Array:

@@ -13,7 +13,6 @@ from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
 from pathspace_graph.graph.variables import name, pose_key
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import LapBatches, VehicleState
-from pathspace_graph.lengths import POSE_LENGTHS, scaled, times
 from pathspace_graph.loop.drive import Drive, Phase
 from pathspace_graph.loop.lost import Lost
 from pathspace_graph.mapping.motion import vehicle_state
@@ -31,7 +30,6 @@ class MapperEstimate:
     """Read-only queries of a fixed-lag mapper."""
 
     settings: MapperSettings
-    scale: float
     road: Road
     drive: Drive
     phase: Phase
@@ -48,7 +46,7 @@ class MapperEstimate:
 
         An open curve includes the tentative stretch that `outline` describes.
         """
-        return scaled(map_of(self.road, self._sigma_size), self.scale)
+        return map_of(self.road, self._sigma_size)
 
     def outline(self) -> Map:
         """Return a copy of the map without covariances, in a hundredth of the time of `map`.
@@ -56,7 +54,7 @@ class MapperEstimate:
         Past `confirmed_until` an open curve is tentative: each call fits it through cones with fewer
         detections. A boundary without a confirmed curve may consist of a tentative stretch alone.
         """
-        return scaled(outline_of(self.road), self.scale)
+        return outline_of(self.road)
 
     def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
         """Return the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
@@ -66,10 +64,9 @@ class MapperEstimate:
         closed map, the line is the road mapped since then. SettingsError is raised for a length out of its
         range.
         """
-        check_line(distance, step, self.scale)
+        check_line(distance, step)
         new_road = self.phase.new_road if isinstance(self.phase, Lost) else None
-        line = track_ahead_of(new_road or self.road, distance / self.scale, step / self.scale)
-        return scaled(line, self.scale)
+        return track_ahead_of(new_road or self.road, distance, step)
 
     def looked_at(self) -> AbstractContextManager[None]:
         """Return a context in which no query changes the estimate.
@@ -84,12 +81,12 @@ class MapperEstimate:
 
         Parameters of the foot points are of the last linearization, positions of the present curve.
         """
-        return scaled(readings_of(self.road), self.scale)
+        return readings_of(self.road)
 
     def vehicle_state(self) -> VehicleState:
         """Return the newest pose and the calibration, with their joint covariance."""
         with self.looked_at():
-            return scaled(vehicle_state(self.road.smoother, self._sigma_size), self.scale)
+            return vehicle_state(self.road.smoother, self._sigma_size)
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return the window as GTSAM factors: projection, gauge, odometry, stations, user factors and prior.
@@ -155,7 +152,7 @@ class MapperEstimate:
 
     def smoothed(self, t: Array) -> Array:
         """Return the corrected poses (n, 3) at stamps t (n,) of cycles; NaN after the last corrected one."""
-        poses: Array = times(self.corrected_poses, POSE_LENGTHS, self.scale)
+        poses = self.corrected_poses
         return smoothed_at(t, np.array([*self.drive.record.stamps][: len(poses)]), poses)
 
     @property
@@ -204,8 +201,7 @@ class MapperEstimate:
 
     def window_poses(self) -> Array:
         """Return a copy of the poses (P, 3) in the window, oldest first, map frame."""
-        poses: Array = times(self.poses.copy(), POSE_LENGTHS, self.scale)
-        return poses
+        return self.poses.copy()
 
     @property
     def calibration(self) -> Array:

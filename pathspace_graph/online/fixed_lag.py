@@ -18,7 +18,6 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.lengths import POSE_LENGTHS, joined, scaled, times
 from pathspace_graph.loop.drive import Drive, Phase
 from pathspace_graph.loop.open import Open
 from pathspace_graph.loop.seeking import Seeking
@@ -61,11 +60,9 @@ class FixedLagMapper(MapperEstimate):
         self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
     ) -> None:
         self.settings = known_settings(settings)
-        self.scale = self.settings.scale or 1.0
-        """Scale of the scene: cycles and results are in its metres."""
-        noise = known_noise(odometry_sigma, self.scale)
+        noise = known_noise(odometry_sigma)
         self.failures = 0  # number of failed updates
-        self.front_end = FrontEnd(self.settings, noise, self.scale)
+        self.front_end = FrontEnd(self.settings, noise)
         self.road: Road = self.ROAD(self.settings)
         self.drive = Drive(self.settings)
         self.phase: Phase = self.FIRST_PHASE(self.settings)
@@ -92,10 +89,8 @@ class FixedLagMapper(MapperEstimate):
         covariances.
         """
         mapper = cls(settings, odometry_sigma)
-        known, pose = scaled(track, 1.0 / mapper.scale), None
-        if start is not None:
-            pose = times(np.array(start, float), POSE_LENGTHS, 1.0 / mapper.scale)
-        mapper.phase = Seeking(mapper.settings, known, pose, keep)
+        pose = None if start is None else np.array(start, float)
+        mapper.phase = Seeking(mapper.settings, track, pose, keep)
         return mapper
 
     def update(
@@ -115,7 +110,7 @@ class FixedLagMapper(MapperEstimate):
         The call waits for a running batch no longer than the time since the previous cycle. A replay calls
         `wait` first, so that the map does not depend on the speed of the machine.
 
-        `factors` are GTSAM factors of your own, at scale 1, on poses in the window (`pose_key`,
+        `factors` are GTSAM factors of your own, on poses in the window (`pose_key`,
         `next_pose_key`: `Pose2`), on control points (`control_keys`: `Point2`) and on the calibration. Each
         is relinearized at every step until one of its poses leaves the window; then it is part of the prior.
         The batch of the lap includes factors on poses, linearized in this cycle. A factor on control points
@@ -163,7 +158,7 @@ class FixedLagMapper(MapperEstimate):
         road.marginalize(drive.solver.first_kept)
         watch.lap("marginalize")
         self.phase, self.health = step.phase, step.health or health
-        notice = joined([held, step.notice, grown, reading.notice])
+        notice = "; ".join(filter(None, [held, step.notice, grown, reading.notice]))
         return self._result(cycle.detections.t, watch.laps, step.jump, notice)
 
     def _without(
@@ -186,7 +181,7 @@ class FixedLagMapper(MapperEstimate):
             except Exception:  # the next attempt does less
                 continue
             self._unused = None
-            return replace(result, notice=joined([failed, consequence, result.notice]))
+            return replace(result, notice="; ".join(filter(None, [failed, consequence, result.notice])))
         self._go_back(before)
         self._unused = cycle.odometry
         return self._result(cycle.detections.t, {}, None, f"{failed}; the cycle is not used")
@@ -226,4 +221,4 @@ class FixedLagMapper(MapperEstimate):
 
     def noise_used(self) -> RunNoise:
         """Return the noise in use, and the newest measurement."""
-        return scaled(self.front_end.noise_used, self.scale)
+        return self.front_end.noise_used

@@ -73,6 +73,9 @@ class Convert(FolderCommand):
     units: tuple[str, ...] = ()
     """Units of the CSV files: length=mm angle=deg time=ns, also speed=km/h and yaw_rate=deg/s, which
     otherwise follow length and angle. Without them it is m, rad and s."""
+    scale: float = 1.0
+    """Size of the scene by that of a Formula Student track, such as 0.1 for a model car of 1:10 and 3 for a
+    road, which the log states; its lengths are in m."""
     frames: Annotated[Frames, INLINE] = field(default_factory=Frames)
     """Frames of the record."""
     window: Annotated[Window, INLINE] = field(default_factory=Window)

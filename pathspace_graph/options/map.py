@@ -71,6 +71,9 @@ class Online(Checked, Estimation, FolderCommand, group=""):
     """Folder for the map."""
     estimator: Annotated[str, suggest(*ONLINE_NAMES)] = ONLINE_NAMES[0]
     """Name of the online estimator."""
+    scale: float | None = None
+    """Size of the scene by that of a Formula Student track, such as 0.1 for a model car of 1:10 and 3 for a
+    road; by default that of the log."""
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
     on: Path | None = None
@@ -91,7 +94,7 @@ class Online(Checked, Estimation, FolderCommand, group=""):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Batch(Estimation, FolderCommand):
+class Batch(Checked, Estimation, FolderCommand, group=""):
     """Optimize whole logs at once, and write the map, the trajectory, the cycles and a summary.
 
     Several logs of one track give one map, in the frame of the first, and a trajectory for each. A drive that
@@ -104,6 +107,8 @@ class Batch(Estimation, FolderCommand):
     """Folder for the map."""
     estimator: Annotated[str, suggest(*BATCH_NAMES)] = BATCH_NAMES[0]
     """Name of the batch estimator."""
+    scale: float | None = None
+    """Size of the scene by that of a Formula Student track; by default that of the log."""
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
     start: Start | None = None

@@ -16,7 +16,6 @@ from pathspace_graph.health import LOST
 from pathspace_graph.io.header import CALIBRATION
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
-from pathspace_graph.lengths import POSE_LENGTHS, scaled
 from pathspace_graph.spline.crossing import Crossing, crossed_boundaries
 
 from .hint import Hint, hint_of
@@ -40,21 +39,17 @@ def cause_of(name: str, value: float) -> str:
     return words.format(unit * abs(value), positive if value > 0.0 else negative)
 
 
-def by_prior(state: VehicleState, settings: Mapping[str, Any], scale: float = 1.0) -> dict[str, float]:
-    """Return calibrations in standard deviations of their priors, for those with a prior in the settings.
-
-    Lengths of the state are in metres of a scene of this scale, lengths in settings at scale 1.
-    """
-    state = scaled(state, 1.0 / scale)
+def by_prior(state: VehicleState, settings: Mapping[str, Any]) -> dict[str, float]:
+    """Return calibrations in standard deviations of their priors, for those with a prior in the settings."""
     groups = {name: "odometry" if name in CALIBRATION else "calibration" for name in state.by_name}
     priors = {name: settings.get(group, {}).get(f"sigma_{name}") for name, group in groups.items()}
     return {name: state.by_name[name][0] / prior for name, prior in priors.items() if prior is not None}
 
 
-def diagnose(state: VehicleState, settings: Mapping[str, Any], scale: float = 1.0) -> list[str]:
+def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
     """Return a line for each calibration beyond `PRIOR_LIMIT`, with its cause and whether it is certain."""
     lines = []
-    for name, ratio in by_prior(state, settings, scale).items():
+    for name, ratio in by_prior(state, settings).items():
         value, sigma = map(float, state.by_name[name])
         if abs(ratio) > PRIOR_LIMIT:
             certainty = "certain" if abs(value) > CLEAR_ERROR * sigma else "uncertain"
@@ -70,19 +65,18 @@ def crossings_of(result: RunResult) -> list[Crossing]:
     return crossed_boundaries(result.map.splines, path[:, :2], known)
 
 
-NOISE_RANGE: Final = 10.0  # range at which the noise of detections is reported (m, at scale 1)
+NOISE_RANGE: Final = 10.0  # range at which the noise of detections is reported (m)
 CLEAR_ERROR: Final = 4.0  # standard deviations beyond which a measured error of the sensor is reported
-# size beyond which it is reported (rad, m, s, -, m, at scale 1)
+# size beyond which it is reported (rad, m, s, -, m)
 ERROR_WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
-IN_METRES: Final = ("lateral", "range_bias")  # errors of the sensor in m
 CORRELATED_SHARE: Final = 0.1  # share of the variance from which correlated errors are reported
 
 
-def noise_lines(noise: RunNoise | None, scale: float = 1.0) -> list[str]:
+def noise_lines(noise: RunNoise | None) -> list[str]:
     """Return a line on the measured noise, and another one if ranges and speeds disagree."""
     if noise is None or noise.measured is None or "measured" not in (noise.odometry, noise.detections):
         return []
-    lines = [measured_line(noise.measured, scale)]
+    lines = [measured_line(noise.measured)]
     if noise.size is not None:
         share = 100.0 * abs(noise.measured.sensor[SENSOR.index("range_scale")])
         whose, other = {"odometry": ("odometry's", "ranges"), "ranges": ("ranges'", "odometry")}[noise.size]
@@ -91,13 +85,13 @@ def noise_lines(noise: RunNoise | None, scale: float = 1.0) -> list[str]:
     return lines
 
 
-def measured_line(measured: MeasuredNoise, scale: float = 1.0) -> str:
-    """Return a line on the noise in a scene of this scale, and on significant errors of the sensor."""
+def measured_line(measured: MeasuredNoise) -> str:
+    """Return a line on the noise, and on significant errors of the sensor."""
     forward, sideways, turning = (f"{sigma:.2g}" for sigma in measured.odometry)
     line = f"measured: odometry {forward} m/s, {sideways} m/s, {turning} rad/s from sample to sample"
     if measured.along is None or measured.across is None:
         return line
-    rays, at = (measured.along, measured.across), NOISE_RANGE * scale
+    rays, at = (measured.along, measured.across), NOISE_RANGE
     along, across = (float(ray.sigmas(np.array([at]))[0]) for ray in rays)
     line += f"; detections {along:.2g} m along and {across:.2g} m across the ray at {at:g} m"
     if max(ray.share for ray in rays) > CORRELATED_SHARE:
@@ -108,7 +102,7 @@ def measured_line(measured: MeasuredNoise, scale: float = 1.0) -> str:
     clear = [
         cause_of(name, value)
         for name, value, sigma in errors
-        if abs(value) > max(CLEAR_ERROR * sigma, ERROR_WORTH[name] * (scale if name in IN_METRES else 1.0))
+        if abs(value) > max(CLEAR_ERROR * sigma, ERROR_WORTH[name])
     ]
     return f"{line}; {', '.join(clear)}" if clear else line
 
@@ -121,16 +115,16 @@ NOISE_SHARE: Final = 0.75  # least share of the detections with wrong covariance
 NOISE_CYCLES: Final = 300  # largest number of cycles on which the noise of detections is measured
 
 
-def noise_hints(log: Log, scale: float, *, stay: bool = True) -> list[Hint]:
-    """Return hints where the readings of a log at scale 1 contradict the stated noise by a large factor.
+def noise_hints(log: Log, *, stay: bool = True) -> list[Hint]:
+    """Return hints where the readings of a log contradict the stated noise by a large factor.
 
     The noise of detections is measurable only if they `stay` in place, as cones do.
     """
-    found = _odometry_hints(log, scale) if log.odometry_stated else []
-    return found + (_detection_hints(log, scale) if log.detections_stated and stay else [])
+    found = _odometry_hints(log) if log.odometry_stated else []
+    return found + (_detection_hints(log) if log.detections_stated and stay else [])
 
 
-def _odometry_hints(log: Log, scale: float) -> list[Hint]:
+def _odometry_hints(log: Log) -> list[Hint]:
     """Compare white noise: orders of differences that disagree contain motion as well."""
     twists = TwistRecord()
     twists.add(log.odometry)
@@ -140,14 +134,13 @@ def _odometry_hints(log: Log, scale: float) -> list[Hint]:
     (least, interval), stated, hints = white, log.odometry_sigma, []
     agree = orders.max(axis=0) < NOISE_AGREEMENT * least
     most = np.hypot(least, np.array(ASSUMED_DRIFT) / np.sqrt(interval))
-    units = [scale**power for power in POSE_LENGTHS]
     for which, values, size in (
         (agree & (least > NOISE_FACTOR * stated), least, "small"),
         (NOISE_FACTOR * most < stated, most, "large, unless it stands for errors that change slowly"),
     ):
         figures = [
             f"{name} scatters by {value:.2g} {TWIST[name]}, and {said:.2g} is stated"
-            for name, value, said, chosen in zip(TWIST, values * units, stated * units, which, strict=True)
+            for name, value, said, chosen in zip(TWIST, values, stated, which, strict=True)
             if chosen
         ]
         if figures:
@@ -155,7 +148,7 @@ def _odometry_hints(log: Log, scale: float) -> list[Hint]:
     return hints
 
 
-def _detection_hints(log: Log, scale: float) -> list[Hint]:
+def _detection_hints(log: Log) -> list[Hint]:
     """Compare standard deviations along the ray or across it, whichever is farther off.
 
     The size of a cone is the least noise; tracking with a gate limits the largest measurable noise.
@@ -172,7 +165,7 @@ def _detection_hints(log: Log, scale: float) -> list[Hint]:
     floors = np.full(len(ranges), LEAST_NOISE[0]), LEAST_NOISE[1] * ranges
     rays = ("along", measured.along), ("across", measured.across)
     for (way, ray), claimed, floor in zip(rays, stated.T, floors, strict=True):
-        sigmas, scatter = ray.sigmas(ranges), scale * float(ray.sigmas(np.array([at]))[0])
+        sigmas, scatter = ray.sigmas(ranges), float(ray.sigmas(np.array([at]))[0])
         small = (sigmas > SCATTER_FACTOR * np.maximum(claimed, floor)).mean()
         large = ((SCATTER_FACTOR * sigmas < claimed) & (3.0 * sigmas < gate)).mean()
         if max(small, large) > NOISE_SHARE:
@@ -182,7 +175,7 @@ def _detection_hints(log: Log, scale: float) -> list[Hint]:
             how += ", as in another unit, or there are none at all" if is_unit else ""
             figures = {
                 "scatter": scatter,
-                "at": scale * at,
+                "at": at,
                 "stated": scatter * ratio,
                 "way": way,
                 "how": how,

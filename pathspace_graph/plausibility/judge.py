@@ -15,7 +15,6 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.gate import check_usable
-from pathspace_graph.front_end.kind import kind_of
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.covariances import covariances_of
@@ -24,12 +23,11 @@ from pathspace_graph.io.log_files import read_log
 from pathspace_graph.io.parsing import shown
 from pathspace_graph.io.tables import read_table
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
-from pathspace_graph.lengths import scaled
-from pathspace_graph.scale import scale_of
 from pathspace_graph.settings.online import LimitSettings
 
 from .diagnosis import noise_hints
 from .hint import Hint, because, hint_of
+from .kind import is_line
 from .regression import Better, Complex, Fit, Regression, far_better, motions_of
 
 LARGEST_READING: Final = 1e20  # largest number in a log for hints
@@ -51,17 +49,17 @@ def hints(log: Log) -> list[Hint]:
     log, found = stamps_in_seconds(log)
     if of_clocks := one_clock(log):
         return found + of_clocks
-    scale = scale_of(log)
-    log = scaled(log, 1.0 / scale)
+    log = log.at_scale_one()
     of_cycles = gaps_and_reach(log)
-    log, of_positions = positions_in_metres(log, scale)
+    log, of_positions = positions_in_metres(log)
     log, of_rows = possible_rows(log)
-    stay = kind_of(log) in ("cones", None)
+    stay = log.sensor.kind != "line" and not is_line(log)
     with threadpool_limits(limits=1):
-        found += of_positions + of_rows + (camera(log, scale) or motion_hints(log, scale))
+        found += of_positions + of_rows + (camera(log) or motion_hints(log))
+        found = found or of_kind(log)
         if not found and stay:
             found = one_label(log) + side_hints(log)
-    return of_cycles + (found or noise_hints(log, scale, stay=stay))
+    return of_cycles + (found or noise_hints(log, stay=stay))
 
 
 # --- stamps, units and rows by typical values ------------------------------------------------------------
@@ -132,7 +130,7 @@ def gaps_and_reach(log: Log) -> list[Hint]:
     return found + ([hint_of("few detections", count=typical, least=MIN_MATCHED)] if few else [])
 
 
-def positions_in_metres(log: Log, scale: float = 1.0) -> tuple[Log, list[Hint]]:
+def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
     typical, (least, likely, most) = _median(np.abs(_points(log))), USUAL_RANGES
     if typical > most:
         size = next((size for size in LENGTH_UNITS if typical * size <= likely), min(LENGTH_UNITS))
@@ -142,7 +140,7 @@ def positions_in_metres(log: Log, scale: float = 1.0) -> tuple[Log, list[Hint]]:
     else:
         return log, []
     cycles = tuple(replace(cycle, points_vehicle=cycle.points_vehicle * size) for cycle in log.cycles)
-    hint = hint_of("unit of positions", typical=scale * typical, what=what, size=size)
+    hint = hint_of("unit of positions", typical=typical, what=what, size=size)
     return replace(log, cycles=cycles), [hint]
 
 
@@ -160,16 +158,16 @@ def possible_rows(log: Log) -> tuple[Log, list[Hint]]:
     return replace(log, odometry=replace(log.odometry, twist=np.where(wrong, smooth, twist))), [hint]
 
 
-def beyond_any_vehicle(log: Log, scale: float) -> list[Hint]:
+def beyond_any_vehicle(log: Log) -> list[Hint]:
     speed, rate = (np.quantile(one, 0.9) for one in (_speeds(log), np.abs(log.odometry.twist[:, 2])))
-    found = [hint_of("too fast", speed=scale * speed)] if speed > FASTEST[0] else []
+    found = [hint_of("too fast", speed=speed)] if speed > FASTEST[0] else []
     return found + ([hint_of("turns too fast", rate=rate)] if rate > FASTEST[1] else [])
 
 
-def camera(log: Log, scale: float) -> list[Hint]:
+def camera(log: Log) -> list[Hint]:
     """Return a hint if the detections lie on a line, as with the axes of a camera."""
     points = _points(log)
-    spread = scale * np.array([points.real.std(), points.imag.std()]) if len(points) else np.ones(2)
+    spread = np.array([points.real.std(), points.imag.std()]) if len(points) else np.ones(2)
     least, most = spread.min(), spread.max()
     in_line = least < LINE_RATIO * most
     return [hint_of("camera", thin="xy"[int(spread.argmin())], least=least, most=most)] if in_line else []
@@ -240,24 +238,34 @@ FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation 
     (180, True): ("the sensor's frame has x to the rear", "-x", "y"),
     (-90, True): ("the sensor's frame has x to the right and y to the rear", "-y", "-x"),
 }
+
+
+def of_kind(log: Log) -> list[Hint]:
+    """Return a hint if detections are of the other kind than the log says, which is cones by default."""
+    stated = log.sensor.kind or "cones"
+    found = {True: "line", False: "cones", None: stated}[is_line(log)]
+    return [hint_of(f"kind {found}", stated=stated)] if found != stated else []
+
+
 OF_LINES: Final = {"yaw rate", "clocks", "y to the right"}  # causes that points of lines tell
 Told = dict[Hint, float]  # hints, and how much more of the motions each explains
 
 
-def motion_hints(log: Log, scale: float) -> list[Hint]:
+def motion_hints(log: Log) -> list[Hint]:
     """Return hints by the regression, the strongest first."""
     motions, told = motions_of(log), Told()
     share = 100.0 * len(motions.rate) / max(motions.tried, 1)
     few = motions.tried >= LEAST_PAIRS and share < UNEXPLAINED[0]
     unexplained = [hint_of("unexplained", share=share, tried=motions.tried)] if few else []
     if len(motions.rate) < LEAST_MOTIONS:
-        return beyond_any_vehicle(log, scale) or unexplained
+        return beyond_any_vehicle(log) or unexplained
     regression = Regression(log.odometry, motions)
     fit, why = regression.best()
     explained, rest = regression.explained(fit), regression.shares(0.0 * motions.velocity, 0.0 * motions.rate)
     may_rest = rest.both.mean() > explained.both.mean() - AT_REST
+    stated = log.sensor.kind == "line"
     lines, of_log = (
-        kind_of(one) not in ("cones", None) for one in (replace(log, odometry=regression.odometry(fit)), log)
+        stated or bool(is_line(one)) for one in (replace(log, odometry=regression.odometry(fit)), log)
     )
     at_rest = far_better(rest.both, regression.explained(Fit()).both)
     if at_rest and may_rest and not (lines or of_log):
@@ -271,12 +279,12 @@ def motion_hints(log: Log, scale: float) -> list[Hint]:
     else:
         late = why.get("lag") if abs(fit.lag) > LATE_TOLD else None
         tell(told, late, "late" if fit.lag > 0.0 else "early", seconds=abs(fit.lag))
-        tell_missing(told, regression, fit, scale)
+        tell_missing(told, regression, fit)
     if not may_rest and all(hint.cause != "speeds" for hint in told):
         tell_factors(told, regression, fit)
-        tell_frame(told, regression, fit, log, scale)
+        tell_frame(told, regression, fit, log)
     told = {hint: gain for hint, gain in told.items() if not lines or hint.cause in OF_LINES}
-    return sorted(told, key=lambda hint: -told[hint]) or beyond_any_vehicle(log, scale)
+    return sorted(told, key=lambda hint: -told[hint]) or beyond_any_vehicle(log)
 
 
 def tell(told: Told, better: Better | None, mistake: str, **figures: Any) -> None:
@@ -284,14 +292,14 @@ def tell(told: Told, better: Better | None, mistake: str, **figures: Any) -> Non
         told[hint_of(mistake, evidence=better.words, **figures)] = better.gain
 
 
-def tell_missing(told: Told, regression: Regression, fit: Fit, scale: float) -> None:
+def tell_missing(told: Told, regression: Regression, fit: Fit) -> None:
     """Tell a speed or a yaw rate that the cones show and the odometry has not."""
     explained, (shown_v, shown_w) = regression.explained(fit), regression.around()
     seen, (v, w) = regression.shares(shown_v, shown_w), regression.predicted(fit)
     stated_v, stated_w = regression.stated(fit.content, fit.lag)
     turn, way = far_better(seen.turn, explained.turn), far_better(seen.way, explained.way)
     rates = {"stated": float(stated_w.std()), "seen": float(shown_w.std())}
-    speeds = {"stated": scale * np.abs(stated_v).mean(), "seen": scale * np.abs(shown_v).mean()}
+    speeds = {"stated": np.abs(stated_v).mean(), "seen": np.abs(shown_v).mean()}
     backward = regression.shares(np.where((v.conj() * shown_v).real < 0.0, -v, v), w)
     if turn and rates["stated"] < FLAT * rates["seen"]:
         tell(told, turn, "no yaw rate", **rates)
@@ -328,7 +336,7 @@ def unit_of(size: float, units: Mapping[float, str]) -> tuple[str, float]:
     return "" if 1.0 / FACTOR_TOLD < size < FACTOR_TOLD else f"units of {size:.3g}", size
 
 
-def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log, scale: float) -> None:
+def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log) -> None:
     """Tell whether detections, or else the odometry, have other axes than the vehicle, or another origin."""
     explained, opposite = regression.explained(fit), regression.explained(replace(fit, rate=abs(fit.rate)))
     mirror, size = far_better(explained.turn, opposite.turn), max(abs(fit.gain), TINY)
@@ -356,7 +364,7 @@ def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log, scale: fl
         of_detections = sided(log, back, mirrored=True) >= sided(log, np.conj(back))
         tell(told, mirror, "y to the right" if of_detections else "yaw rate to the right")
     if clear and abs(fit.lever) > max(LEVER_TOLD, fit.sigmas[1] / LEVER_SIGMA):
-        place = scale * fit.lever * np.conj(fit.gain) / size
+        place = fit.lever * np.conj(fit.gain) / size
         ahead, left = place.real, -place.imag if mirror else place.imag
         tell(told, sure, "place", ahead=ahead, left=left, along=f"{ahead:+.2f}", aside=f"{left:+.2f}")
 
@@ -386,17 +394,26 @@ REFUSABLE: Final = {"stamps", "clocks", "positions", "speeds", "yaw rate", "odom
 SHOWN_WORDS: Final = 3  # largest number of foreign labels in a hint
 
 
-def read_usable_log(folder: Path, limits: LimitSettings) -> Log:
-    """Read a log and check all its cycles; an unusable one raises an InputError with file, row and stamp."""
+def read_usable_log(folder: Path, limits: LimitSettings, scale: float | None = None) -> Log:
+    """Read a log and check all its cycles; an unusable one raises an InputError with file, row and stamp.
+
+    A `scale` of the scene replaces that of the log.
+    """
     log = read_log(folder)
+    log = log if scale is None else replace(log, scale=scale)
     check_usable(log, folder, limits)
     return log
 
 
-def read_plausible_log(folder: Path, limits: LimitSettings) -> tuple[Log, list[Hint]]:
-    """Read and check a log; an InputError names file, row, what was expected, and the likely cause."""
+def read_plausible_log(
+    folder: Path, limits: LimitSettings, scale: float | None = None
+) -> tuple[Log, list[Hint]]:
+    """Read and check a log; an InputError names file, row, what was expected, and the likely cause.
+
+    A `scale` of the scene replaces that of the log.
+    """
     try:
-        log = read_usable_log(folder, limits)
+        log = read_usable_log(folder, limits, scale)
     except InputError as error:
         of_data = error.file.name in (ODOMETRY_FILE, DETECTIONS_FILE)
         found = [hint for hint in refused_hints(folder) if hint.cause in REFUSABLE] if of_data else []

@@ -1,10 +1,10 @@
 """Settings of the estimators; a number that nobody changes is a constant, here or beside its use."""
 
-from dataclasses import dataclass, field
-from typing import ClassVar, Final, Literal
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Literal, Self
 
 from pathspace_graph.errors import SettingsError, check_type
-from pathspace_graph.labels import LEFT, RIGHT, Kind
+from pathspace_graph.labels import Kind
 
 from .checked import Checked, Unlimited
 from .online import (
@@ -19,11 +19,6 @@ from .online import (
 
 Knots = Literal["cones", "curvature"]  # what the knots of a closed boundary follow
 Start = Literal["auto", "online", "odometry"]
-_LINES: Final[dict[Kind | None, tuple[int, ...]]] = {  # boundaries that are lines
-    "line": (LEFT, RIGHT),
-    "line-left": (LEFT,),
-    "line-right": (RIGHT,),
-}
 
 
 @dataclass(frozen=True)
@@ -231,12 +226,7 @@ class MapperSettings(Checked, group=""):
     of the sensor are measured unless this is `stated`."""
     kind: Kind | None = None
     """What detections are of: cones, which stay where they are, or a line, whose points lie anywhere along
-    it, on both sides or on one. By default the log states it, or its first seconds tell it; an online
-    estimator that is made without one takes cones, and a notice appears if they are of a line."""
-    scale: float | None = None
-    """Size of the scene by that of a Formula Student track: 0.1 for a model car of 1:10, 3 for a road. All
-    lengths of the settings are those at scale 1. By default the first metres of the log tell it; an online
-    estimator that is made without one takes it as 1."""
+    it. By default it is what the log states, and cones where it states nothing."""
     limits: LimitSettings = field(default_factory=LimitSettings)
     spline: SplineSettings = field(default_factory=SplineSettings)
     gauge: GaugeSettings = field(default_factory=GaugeSettings)
@@ -256,9 +246,14 @@ class MapperSettings(Checked, group=""):
     sigma_step: ClassVar[float] = 0.5  # of a control point's move in a step, m: damps sliding along the curve
 
     @property
-    def lines(self) -> tuple[int, ...]:
-        """Labels of the boundaries that are lines."""
-        return _LINES.get(self.kind, ())
+    def of_lines(self) -> bool:
+        """Whether detections are points of lines."""
+        return self.kind == "line"
+
+    def with_kind(self, stated: Kind | None) -> Self:
+        """Return settings with the stated kind where they leave it open; lines have no stations."""
+        kind = self.kind or stated or "cones"
+        return replace(self, kind=kind, stations=self.stations and kind == "cones")
 
     @property
     def calibrations(self) -> tuple[float, ...]:

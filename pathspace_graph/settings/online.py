@@ -62,12 +62,10 @@ class ClosingSettings(Checked):
 
 @dataclass(frozen=True)
 class LimitSettings(Checked, group="limits"):
-    """What a vehicle and its sensors can do at most, at scale 1.
+    """What a vehicle and its sensors can do at most.
 
     A cycle beyond that is refused; a single detection beyond the range is dropped instead.
     """
-
-    LENGTHS: ClassVar = {"speed": 1, "range_max": 1}
 
     speed: float = 100.0
     """Largest speed ahead or to a side, m/s."""

@@ -52,10 +52,6 @@ class TrackAhead:
     known, and fewer than requested if the map ends before.
     """
 
-    LENGTHS: ClassVar = {"curvature": -1} | dict.fromkeys(
-        ("points", "arc_length", "width_left", "width_right", "left", "right"), 1
-    )
-
     points: Array
     """Points (n, 2) in m; the first one is beside the vehicle."""
     heading: Array
@@ -95,9 +91,9 @@ def check_length(name: str, length: float, least: float = 0.0) -> None:
     raise SettingsError(f"{name}: expected {expected}, found {found}")
 
 
-def check_line(distance: float, step: float, scale: float) -> None:
-    """Raise a SettingsError unless distance and step (m) are in range for a scene of this scale."""
-    check_length("step", step, LEAST_STEP * scale)
+def check_line(distance: float, step: float) -> None:
+    """Raise a SettingsError unless distance and step (m) are in range."""
+    check_length("step", step, LEAST_STEP)
     check_length("distance", distance)
     check_length("step", step, distance / MOST_POINTS)
 

@@ -15,7 +15,6 @@ from scipy.spatial import KDTree
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.labels import LEFT, NAMES
-from pathspace_graph.lengths import Length, Text
 
 from .boundary import crossing_segments
 from .bspline import BSpline, cross, dot
@@ -47,11 +46,10 @@ def crossings_told(found: list[Crossing]) -> str:
     if not found:
         return ""
     first, more = found[0], f", and at {len(found) - 1} more" if len(found) > 1 else ""
-    x, y, driven = map(Length, (*first.place.tolist(), first.driven))
-    return Text(
-        "the {name} boundary lies across the driven path at x = {x:.3g} m, y = {y:.3g} m, after "
-        "{driven:.3g} m{more}",
-        **{"name": NAMES[first.label], "x": x, "y": y, "driven": driven, "more": more},
+    x, y = first.place.tolist()
+    return (
+        f"the {NAMES[first.label]} boundary lies across the driven path at x = {x:.3g} m, y = {y:.3g} m, "
+        f"after {first.driven:.3g} m{more}"
     )
 
 

@@ -184,8 +184,7 @@ def test_stations_hold_the_vehicle_along_the_curves() -> None:
     assert error[1] < error[0]
 
 
-def test_a_road_with_a_line_has_no_stations() -> None:
-    """Points of a line are at no station, and cones of one side alone are not matched."""
+def test_a_road_of_lines_has_no_stations() -> None:
     system, state = straight()
-    settings = replace(system.settings, kind="line-right")
+    settings = replace(system.settings, kind="line")
     assert match_stations(state, system.detections, settings) is None

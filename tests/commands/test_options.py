@@ -118,7 +118,6 @@ def test_flags_of_every_command_stand_before_or_after_it() -> None:
 CHANGED = replace(
     MapperSettings(),
     lag=2.0,
-    scale=0.1,
     gate=GateSettings(chi=2.5, huber=inf),
     open_lap=replace(MapperSettings().open_lap, ends=(3, 7)),
 )

@@ -355,7 +355,7 @@ def test_polylines_beside_cones_are_left_out_unless_a_spacing_is_stated(
     lines += [json.dumps({"t": 0.1 * k, **entry}) for k in range(1, 9)]
     (tmp_path / "drive.jsonl").write_text("\n".join(lines))
     log = converted(tmp_path / "drive.jsonl", tmp_path / "log", "--from", "jsonl")
-    assert log.sensor.kind is None
+    assert log.sensor.kind == "cones"
     assert {len(cycle.labels) for cycle in log.cycles} == {1}
     assert "16 points of polylines beside cones were left out" in capsys.readouterr().out
     log = converted(tmp_path / "drive.jsonl", tmp_path / "other", "--from", "jsonl", "--spacing", "1")

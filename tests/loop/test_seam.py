@@ -102,5 +102,5 @@ def test_the_size_is_a_share_of_the_cones_of_one_lap(share: float, size: int) ->
 
 def test_the_size_of_a_line_is_a_share_of_places_3_m_apart_and_not_of_its_points() -> None:
     """A lap of 94 m has 31 of them before the seam, of which 0.43 are 13, however many points were merged."""
-    new = make_periodic(*circle(1.1), MapperSettings(), "cones", is_line=True)
+    new = make_periodic(*circle(1.1), MapperSettings(kind="line"), "cones")
     assert len(new.points) == 13

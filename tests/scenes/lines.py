@@ -31,7 +31,9 @@ def line_drive(seed: int = 1, spacing: float = 1.0) -> Log:
         labels = np.repeat(BOUNDARIES, [len(points) for points in seen])
         covariances = np.tile(SIGMA**2 * np.eye(2), (len(labels), 1, 1))
         cycles.append(Detections(cycle.t, np.concatenate(seen), covariances, labels))
-    return replace(log, cycles=tuple(cycles), sensor=SensorInfo(), truth=replace(truth, associations=None))
+    return replace(
+        log, cycles=tuple(cycles), sensor=SensorInfo(kind="line"), truth=replace(truth, associations=None)
+    )
 
 
 def seen_of(row: np.ndarray, pose: np.ndarray, spacing: float, rng: np.random.Generator) -> np.ndarray:

@@ -200,7 +200,7 @@ def spied(settings: Any, seen: set[str], prefix: str = "") -> Any:
 def test_an_estimator_reads_the_settings_that_it_says(name: str) -> None:
     seen: set[str] = set()
     log = noisy_lap()
-    settings = spied(MapperSettings(scale=1.0, kind="cones"), seen)
+    settings = spied(MapperSettings(kind="cones"), seen)
     estimator = registry.ONLINE[name](settings, log.noise)
     seen.clear()
     for odometry, detections in [*split_odometry(log)][:80]:

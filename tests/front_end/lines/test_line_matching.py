@@ -7,7 +7,7 @@ import numpy as np
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.front_end.line_matching import LineMatch, Seen, merged, targets_on_lines
-from pathspace_graph.front_end.scan_matching import MATCH_LIMITS, REACHES, REACHES_CHECK
+from pathspace_graph.front_end.scan_matching import MATCH_LIMITS, REACHES
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.run import split_odometry
@@ -17,7 +17,6 @@ from ...scenes.lines import line_drive
 
 AT = np.arange(0.0, 15.0, 0.4)
 CORRIDOR = np.concatenate([np.column_stack([AT, np.full(len(AT), side)]) for side in (2.0, -2.0)])
-NO_CONES = np.zeros((0, 2))
 
 
 def test_a_point_is_drawn_across_the_line_beside_it() -> None:
@@ -40,8 +39,8 @@ def test_walls_tell_the_way_across_and_the_turn_and_nothing_along() -> None:
     """The vehicle is 0.2 m to the left and turned by 0.02 rad; its points are at other places than before."""
     true = np.array([0.0, 0.2, 0.02])
     points = to_vehicle(CORRIDOR + np.array([0.17, 0.0]), np.tile(true, (len(CORRIDOR), 1)))
-    seen = Seen(points, np.full(len(points), 0.01), np.ones(len(points), bool))
-    match = LineMatch(NO_CONES, CORRIDOR, seen, MATCH_LIMITS)
+    seen = Seen(points, np.full(len(points), 0.01))
+    match = LineMatch(CORRIDOR, seen, MATCH_LIMITS)
     pose, information, matched, square = match.found(np.zeros(3), REACHES)
     np.testing.assert_allclose(pose, true, atol=2e-3)
     sigmas = np.sqrt(np.diag(np.linalg.inv(information)))
@@ -52,41 +51,22 @@ def test_walls_tell_the_way_across_and_the_turn_and_nothing_along() -> None:
     assert square / matched.sum() < 1e-2
 
 
-def test_cones_beside_a_wall_are_matched_with_it() -> None:
-    """The wall is on the right, three cones on the left, and the vehicle is 0.1 m to the left.
-
-    A fourth cone, last in the list, was not there before.
-    """
-    cones, wall = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0]]), CORRIDOR[CORRIDOR[:, 1] < 0.0]
-    true, every = np.array([0.3, 0.1, 0.0]), np.concatenate([cones, wall])
-    every = np.concatenate([every, [[14.0, 5.0]]])
-    points = to_vehicle(every, np.tile(true, (len(every), 1)))
-    is_line = np.isin(np.arange(len(every)), np.arange(len(wall)) + len(cones))
-    seen = Seen(points, np.full(len(points), 0.01), is_line)
-    match = LineMatch(cones, wall, seen, MATCH_LIMITS)
-    pose, _, matched, _ = match.found(np.array([0.3, 0.0, 0.0]), REACHES_CHECK)
-    np.testing.assert_allclose(pose, true, atol=0.02)
-    assert matched[:3].all()
-    assert not matched[-1]
-
-
 def test_points_of_a_line_in_one_cell_become_their_mean() -> None:
-    points = np.array([[3.1, 2.0], [3.3, 2.2], [3.5, 2.4], [4.5, 2.0], [3.2, 2.1], [3.4, 2.3]])
-    labels = np.array([LEFT, LEFT, LEFT, LEFT, RIGHT, LEFT])
-    cycle = Detections(1.0, points, np.tile(0.04 * np.eye(2), (6, 1, 1)), labels)
-    found = merged(cycle, np.array([True, True, True, True, True, False]))
+    points = np.array([[3.1, 2.0], [3.3, 2.2], [3.5, 2.4], [4.5, 2.0], [3.2, 2.1]])
+    labels = np.array([LEFT, LEFT, LEFT, LEFT, RIGHT])
+    found = merged(Detections(1.0, points, np.tile(0.04 * np.eye(2), (5, 1, 1)), labels))
     by_x = np.argsort(found.points_vehicle[:, 0], kind="stable")
-    np.testing.assert_allclose(found.points_vehicle[by_x], [[3.2, 2.1], [3.3, 2.2], [3.4, 2.3], [4.5, 2.0]])
-    assert found.labels[by_x].tolist() == [RIGHT, LEFT, LEFT, LEFT]
+    np.testing.assert_allclose(found.points_vehicle[by_x], [[3.2, 2.1], [3.3, 2.2], [4.5, 2.0]])
+    assert found.labels[by_x].tolist() == [RIGHT, LEFT, LEFT]
     variances = found.covariances[by_x][:, 0, 0]
-    np.testing.assert_allclose(variances, [0.04, 0.04 / 3.0, 0.04, 0.04])
+    np.testing.assert_allclose(variances, [0.04, 0.04 / 3.0, 0.04])
 
 
 def test_cells_double_with_the_range() -> None:
     x = np.array([10.2, 11.2, 12.2, 13.8, 14.2, 24.2, 27.8, 28.2])
     points = np.column_stack([x, np.full(8, 0.5)])
     cycle = Detections(1.0, points, np.tile(0.04 * np.eye(2), (8, 1, 1)), np.full(8, LEFT))
-    found = np.sort(merged(cycle, np.ones(8, bool)).points_vehicle[:, 0])
+    found = np.sort(merged(cycle).points_vehicle[:, 0])
     np.testing.assert_allclose(found, [10.2, 11.2, 13.0, 14.2, 26.0, 28.2])
 
 
