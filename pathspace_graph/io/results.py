@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Self
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+from pathspace_graph.factors.se2 import compose
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
 from pathspace_graph.provenance import made
@@ -213,6 +214,10 @@ class RunResult:
         health = [record.health for record in self.cycles]
         paths = {"trajectory": self.trajectory, "smoothed": self.smoothed}
         return self.map.plot(**paths, health=health, **options)
+
+    def moved(self, motion: Array) -> Self:
+        """Move the last map and the trajectory by a motion (3,) of their frame."""
+        return replace(self, map=self.map.moved(motion), trajectory=compose(motion, self.trajectory))
 
     def at_scale_one(self) -> Self:
         """Rescale the result to the size of a Formula Student track."""

@@ -24,7 +24,6 @@ from pathspace_graph.io.map import (
     map_to_json,
     read_map,
 )
-from pathspace_graph.io.moved import moved
 from pathspace_graph.labels import LEFT, ORANGE, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import fit_spline
@@ -292,7 +291,7 @@ def test_points_and_covariances_turn_with_the_frame() -> None:
     line = fit_spline(np.column_stack([np.arange(8.0), np.zeros(8)]), 5, False)
     boundaries = {LEFT: SplineBoundary(line, np.eye(10)), RIGHT: PointBoundary(points, joint)}
     cones = {ORANGE: PointBoundary(points, joint)}
-    found = moved(Map(False, boundaries, np.eye(14), cones), QUARTER)
+    found = Map(False, boundaries, np.eye(14), cones).moved(QUARTER)
     right = found.boundaries[RIGHT]
     assert isinstance(right, PointBoundary)
     for own in (right, found.points[ORANGE]):
