@@ -94,7 +94,7 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
         odometry.t,
         moved,
         detections.t,
-        [scan for _, scan in detections.values],
+        Points.joined([points for _, points in detections.values]),
         source,
         notes,
         mounting=mounting,

@@ -23,10 +23,9 @@ WALL_FARTHEST: Final = 3.0  # distance of a boundary point from the path, in dis
 NEXT_LINE: Final = 1.5  # distance of a polyline from the path, in distances of the nearest one on its side
 
 
-def are_lines(scans: list[Points], spacing: float | None) -> bool:
+def are_lines(points: Points, spacing: float | None) -> bool:
     """Whether a record has points of lines: a spacing is stated, or no point stands alone."""
-    lines = np.concatenate([np.zeros(0, int), *(scan.lines for scan in scans)])
-    return spacing is not None or bool(len(lines) and (lines != ALONE).all())
+    return spacing is not None or bool(len(points.lines) and (points.lines != ALONE).all())
 
 
 def default_spacing(scans: list[Points]) -> float:
@@ -104,7 +103,7 @@ def along_lines(points: Points, spacing: float) -> Points:
         placed = resampled(own.points, spacing)
         labels = np.full(len(placed), own.labels[0])
         parts.append(Points.of(placed, labels, lines=np.full(len(placed), line)))
-    return Points(*map(np.concatenate, zip(*parts, strict=True)))
+    return Points.joined(parts)
 
 
 def resampled(vertices: Array, spacing: float) -> Array:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
+from itertools import pairwise
 from numbers import Real
 from typing import Any, Final, NamedTuple
 
@@ -48,12 +49,13 @@ def first_of(holder: Any, names: Iterable[str]) -> Any:
 
 
 class Points(NamedTuple):
-    """Detected points of one message, in the frame of its sensor."""
+    """Detected points of a message or of several, in the frame of their sensor."""
 
     points: Array  # (m, 2) points in m
     covariances: Array  # (m, 2, 2) covariances in m^2, NaN where the message does not give them
     labels: IntArray  # (m,) labels
     lines: IntArray  # (m,) number of the polyline of each, in the order of its vertices; or ALONE, or DENSE
+    message: IntArray  # (m,) number of the message of each, in order
 
     @classmethod
     def of(cls, points: Any, labels: Any, covariances: Any = None, lines: Any = ALONE) -> "Points":
@@ -62,11 +64,23 @@ class Points(NamedTuple):
         covariances = np.full((len(placed), 2, 2), np.nan) if covariances is None else covariances
         covariances = np.array(covariances, float).reshape(-1, 2, 2)
         lines = np.array(np.broadcast_to(lines, len(placed)), dtype=int)
-        return cls(placed, covariances, np.array(labels, dtype=int), lines)
+        return cls(placed, covariances, np.array(labels, dtype=int), lines, np.zeros(len(placed), int))
+
+    @classmethod
+    def joined(cls, messages: Sequence["Points"]) -> "Points":
+        """Join the points of messages, which get their numbers."""
+        numbers = np.repeat(np.arange(len(messages)), [len(one.labels) for one in messages])
+        columns = zip(cls.of([], []), *messages, strict=True)
+        return cls(*map(np.concatenate, columns))._replace(message=numbers)
+
+    def apart(self, count: int) -> list["Points"]:
+        """Points of each of so many messages."""
+        ends = np.searchsorted(self.message, np.arange(count + 1))
+        return [self.where(slice(*span)) for span in pairwise(ends.tolist())]
 
     def where(self, chosen: BoolArray | IntArray | slice) -> "Points":
-        points, covariances, labels, lines = self
-        return Points(points[chosen], covariances[chosen], labels[chosen], lines[chosen])
+        columns: Iterable[Any] = (column[chosen] for column in self)
+        return Points(*columns)
 
     def equals(self, other: "Points") -> bool:
         return np.array_equal(self.points, other.points) and np.array_equal(self.labels, other.labels)

@@ -18,7 +18,7 @@ from pathspace_graph.io.parsing import MAX_RANGE, MAX_STAMP
 from pathspace_graph.labels import UNKNOWN
 
 from . import twists
-from .lines import are_lines, count, in_vehicle, lines_of
+from .lines import are_lines, in_vehicle, lines_of
 from .messages import ALONE, Points
 from .settings import Frames, NoiseSettings, Window
 
@@ -28,6 +28,7 @@ SHORTEST: Final = 1e-6  # least time (s) that gives a rate; a bag of one message
 MOST_PLACES: Final = 5  # number of rows that are named
 REPEATED: Final = 0.02  # distance (m) below which two detections of a message are one
 PAIRED: Final = 0.25  # distance of two detections of one cone, by that of the next one beside them
+APART: Final = 1e6  # distance (m) of two messages where places are compared; no detection is as far
 MOST_PAIRED: Final = 0.5  # share of detections in such pairs from which each cone was reported twice
 # notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
@@ -42,7 +43,7 @@ class Recording:
     t: Array  # (N,) stamps of the odometry (s)
     motion: Array  # (N, 3) twists in m/s, m/s and rad/s, or poses in m, m and rad
     scan_t: Array  # (M,) stamps of the messages with detections (s)
-    scans: list[Points]  # detections of each message, sensor frame
+    points: Points  # detections of all messages, sensor frame
     source: dict[str, str]  # origin of the record, in words
     notes: Counter[str] = field(default_factory=Counter)  # what was done, in words, and how often
     mounting: tuple[float, float, float] | None = None  # sensor's pose (m, m, rad), where it is stated
@@ -65,9 +66,10 @@ class Recording:
 
     def chosen(self, kept: BoolArray, seen: BoolArray) -> "Recording":
         """Keep some rows (N,) of the odometry and some messages (M,) with detections."""
-        scans = [scan for scan, one in zip(self.scans, seen.tolist(), strict=True) if one]
+        points = self.points.where(seen[self.points.message])
+        points = points._replace(message=(np.cumsum(seen) - 1)[points.message])
         scan_t, t, motion = self.scan_t[seen], self.t[kept], self.motion[kept]
-        return replace(self, t=t, motion=motion, rows=self.numbers[kept], scan_t=scan_t, scans=scans)
+        return replace(self, t=t, motion=motion, rows=self.numbers[kept], scan_t=scan_t, points=points)
 
     def at(self, rows: IntArray) -> str:
         """Say where rows of the odometry are."""
@@ -134,12 +136,9 @@ def windowed(record: Recording, window: Window, file: Path) -> Recording:
     record, notes, most = without_strays(record), record.notes, window.range_max
     if most is not None:
         with np.errstate(over="ignore"):
-            near = [np.hypot(*scan.points.T) <= most for scan in record.scans]
-        left_out = sum(int((~one).sum()) for one in near)
-        notes[f"detections farther from the sensor than {most:g} m were left out"] += left_out
-        record = replace(
-            record, scans=[scan.where(one) for scan, one in zip(record.scans, near, strict=True)]
-        )
+            near = np.hypot(*record.points.points.T) <= most
+        notes[f"detections farther from the sensor than {most:g} m were left out"] += int((~near).sum())
+        record = replace(record, points=record.points.where(near))
     record = replace(record, scan_t=record.scan_t + window.time_offset)
     if window.start > 0.0 or window.end < np.inf:  # else stamps that are not finite stay, and are counted
         begin = float(np.nanmin(record.t, initial=np.inf))
@@ -164,16 +163,17 @@ def to_log(
     """
     frames, notes = replace(frames, mounting=frames.mounting or record.mounting), record.notes
     odometry = _odometry(record, frames, file)
-    is_line = are_lines(record.scans, spacing)
+    points, t = record.points, record.scan_t
+    is_line = are_lines(points, spacing)
     if is_line:
-        scans = [usable(scan, notes) for scan in record.scans]
-        scans = lines_of(record.scan_t, scans, odometry, frames, spacing, notes)
+        scans = usable(points, notes).apart(len(t))
+        points = Points.joined(lines_of(t, scans, odometry, frames, spacing, notes))
     else:
-        scans = [scan.where(scan.lines == ALONE) for scan in record.scans]
-        left_out = count(record.scans) - count(scans)
-        notes["points of polylines beside cones were left out (--spacing takes both as lines)"] += left_out
-        scans = merged_pairs([distinct(scan, notes) for scan in scans], notes)
-    cycles = _cycles(replace(record, scans=scans), odometry, frames, noise, file)
+        points = points.where(points.lines == ALONE)
+        told = "points of polylines beside cones were left out (--spacing takes both as lines)"
+        notes[told] += len(record.points.labels) - len(points.labels)
+        points = merged_pairs(distinct(points, notes), notes)
+    cycles = _cycles(t, points, odometry, frames, noise, notes, file)
     return Log(
         odometry,
         cycles,
@@ -294,16 +294,23 @@ def _why(notes: Counter[str], what: str = "detections") -> list[str]:
 
 
 def _cycles(
-    record: Recording, odometry: Odometry, frames: Frames, noise: NoiseSettings, file: Path
+    t: Array,
+    points: Points,
+    odometry: Odometry,
+    frames: Frames,
+    noise: NoiseSettings,
+    notes: Counter[str],
+    file: Path,
 ) -> tuple[Detections, ...]:
-    t, notes = record.scan_t, record.notes
+    """Make cycles of the points of messages at stamps t (M,) in s, in order of time."""
     _check_stamps(t, "detections", file, notes)
     notes["messages with detections were out of order, and were sorted"] += int((np.diff(t) < 0).sum())
     begin, end = float(odometry.t[0]), float(odometry.t[-1]) + logs.MAX_HOLD
+    messages = points.apart(len(t))
     found: dict[float, list[Points]] = {}
     cycle = -np.inf
     for index in np.argsort(t, kind="stable"):
-        points = record.scans[index]
+        points = messages[index]
         if not len(points.labels):
             notes["messages without any detection give no cycle"] += 1
             continue
@@ -326,8 +333,8 @@ def _cycles(
     if not found:
         expected = f"expected detections that can be used, found {len(t)} messages without any"
         raise InputError(file, "; ".join([expected, *_why(notes)]))
-    joined = {stamp: Points(*map(np.concatenate, zip(*scans, strict=True))) for stamp, scans in found.items()}
-    return tuple(in_vehicle_frame(stamp, points, frames, noise, notes) for stamp, points in joined.items())
+    joined = ((stamp, Points.joined(scans)) for stamp, scans in found.items())
+    return tuple(in_vehicle_frame(stamp, points, frames, noise, notes) for stamp, points in joined)
 
 
 def usable(points: Points, notes: Counter[str]) -> Points:
@@ -339,7 +346,7 @@ def usable(points: Points, notes: Counter[str]) -> Points:
 
 
 def distinct(found: Points, notes: Counter[str]) -> Points:
-    """Usable detections of a message, each cone once.
+    """Usable detections, each cone once in a message.
 
     Of those at one place one stays, with a label and a covariance rather than without: an array of markers
     often has a cylinder and an ellipse for each cone.
@@ -347,7 +354,7 @@ def distinct(found: Points, notes: Counter[str]) -> Points:
     found = usable(found, notes)
     without = ~np.isfinite(found.covariances).all(axis=(1, 2))
     order = np.lexsort((without, found.labels == UNKNOWN))
-    pairs = KDTree(found.points[order]).query_pairs(REPEATED, output_type="ndarray")
+    pairs = KDTree(_places(found)[order]).query_pairs(REPEATED, output_type="ndarray")
     if not len(pairs):
         return found
     repeats = order[np.unique(pairs.max(axis=1))]
@@ -355,38 +362,38 @@ def distinct(found: Points, notes: Counter[str]) -> Points:
     return found.where(np.delete(np.arange(len(order)), repeats))
 
 
-def pairs_of_cones(points: Array, most: float | None = None) -> IntArray:
-    """Pairs (k, 2) of points (m, 2) nearest to one another, and far from all others, or `most` apart (m)."""
-    if len(points) < 3:
+def _places(points: Points) -> Array:
+    """Places (m, 3) in m that are near one another in a message only."""
+    return np.column_stack([points.points, APART * points.message])
+
+
+def pairs_of_cones(points: Points, most: float | None = None) -> IntArray:
+    """Pairs (k, 2) of points nearest to one another, and far from all others, or `most` apart (m)."""
+    if len(points.labels) < 3:
         return np.zeros((0, 2), int)
-    found = KDTree(points).query(points, 3)
+    found = KDTree(_places(points)).query(_places(points), 3)
     (_, first, second), (_, other, _) = np.asarray(found[0]).T, np.asarray(found[1]).T
-    own, close = np.arange(len(points)), first < (PAIRED * second if most is None else most)
-    mutual = close & close[other] & (other[other] == own) & (own < other)
+    own, close = np.arange(len(other)), first < (PAIRED * second if most is None else most)
+    mutual = close & close[other] & (other[other] == own) & (own < other) & (second < APART)
     return np.asarray(np.column_stack([own, other])[mutual])
 
 
-def merged_pairs(scans: list[Points], notes: Counter[str]) -> list[Points]:
+def merged_pairs(found: Points, notes: Counter[str]) -> Points:
     """Merge two detections of each cone to their mean, where most cones were reported twice."""
-    pairs = [pairs_of_cones(scan.points) for scan in scans]
-    if 2 * sum(map(len, pairs)) <= MOST_PAIRED * count(scans):
-        return scans
-    ends = [scan.points[two] for scan, two in zip(scans, pairs, strict=True)]
-    usual = float(np.median(np.concatenate([np.hypot(*(two[:, 1] - two[:, 0]).T) for two in ends])))
-    pairs = [pairs_of_cones(scan.points, 2.0 * usual) for scan in scans]
+    pairs = pairs_of_cones(found)
+    if 2 * len(pairs) <= MOST_PAIRED * len(found.labels):
+        return found
+    usual = float(np.median(np.hypot(*(found.points[pairs[:, 1]] - found.points[pairs[:, 0]]).T)))
+    one, other = pairs_of_cones(found, 2.0 * usual).T
     told = f"detections lie in pairs, {usual:.2g} m apart, and were merged to one a cone"
-    notes[told] += 2 * sum(map(len, pairs))
-    merged = []
-    for scan, two in zip(scans, pairs, strict=True):
-        one, other = two.T
-        labels, points, covariances = scan.labels.copy(), scan.points.copy(), scan.covariances.copy()
-        labels[one] = np.where(labels[one] == UNKNOWN, labels[other], labels[one])
-        points[one] = 0.5 * (points[one] + points[other])
-        missing = ~np.isfinite(covariances[one]).all(axis=(1, 2))
-        covariances[one[missing]] = covariances[other[missing]]
-        kept = np.delete(np.arange(len(labels)), other)
-        merged.append(Points(points, covariances, labels, scan.lines).where(kept))
-    return merged
+    notes[told] += 2 * len(one)
+    labels, points, covariances = found.labels.copy(), found.points.copy(), found.covariances.copy()
+    labels[one] = np.where(labels[one] == UNKNOWN, labels[other], labels[one])
+    points[one] = 0.5 * (points[one] + points[other])
+    missing = ~np.isfinite(covariances[one]).all(axis=(1, 2))
+    covariances[one[missing]] = covariances[other[missing]]
+    merged = found._replace(points=points, covariances=covariances, labels=labels)
+    return merged.where(np.delete(np.arange(len(labels)), other))
 
 
 def in_vehicle_frame(

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from itertools import pairwise
 from math import nan, pi
 from pathlib import Path
 from types import SimpleNamespace
@@ -215,8 +214,8 @@ def _motion(file: _File, *, from_poses: bool) -> tuple[Array, bool]:
     return twists, False
 
 
-def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
-    """Stamps of the perception cycles (n,) in s, and the points of each, in the file's order."""
+def _scans(file: _File, rule: LabelRule) -> tuple[Array, Points]:
+    """Stamps of the perception cycles (n,) in s, and their points, in the file's order."""
     t, points, table = file.stamps(), _points(file), file.table
     covariances, labels, lines = None, np.full(len(t), UNKNOWN), np.full(len(t), ALONE)
     if any(map(file.has, COVARIANCE)):
@@ -225,9 +224,9 @@ def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
         labels = rule.of_all(table.columns[file.column("label")])
     if "line" in file.named:
         lines = np.unique(table.columns[file.column("line")], return_inverse=True)[1]
-    starts = np.flatnonzero(np.diff(t, prepend=np.nan))
+    begins = np.diff(t, prepend=np.nan) != 0.0
     detections = Points.of(points, labels, covariances, lines)
-    return t[starts], [detections.where(slice(*span)) for span in pairwise([*starts.tolist(), len(t)])]
+    return t[begins], detections._replace(message=np.cumsum(begins) - 1)
 
 
 def _points(file: _File) -> Array:
@@ -280,7 +279,7 @@ def read_json_lines(
         np.array([t for _, t, _ in entries]),
         np.array([motion for _, _, motion in entries]).reshape(-1, 3),
         np.array(scan_t),
-        scans,
+        Points.joined(scans),
         {"file": file.name},
         are_poses=are_poses,
         is_held=held,

@@ -133,10 +133,10 @@ def test_polylines_keep_their_labels_and_lose_no_other_points() -> None:
 def test_a_record_is_of_lines_where_nothing_stands_alone_or_where_a_spacing_is_stated() -> None:
     alone, dense = (Points.of([[1.0, 1.0]], [LEFT], lines=line) for line in (ALONE, DENSE))
     empty = Points.of([], [])
-    assert are_lines([dense, empty], None)
-    assert not are_lines([alone, dense], None)
-    assert not are_lines([empty], None)
-    assert are_lines([alone], 0.5)
+    assert are_lines(Points.joined([dense, empty]), None)
+    assert not are_lines(Points.joined([alone, dense]), None)
+    assert not are_lines(empty, None)
+    assert are_lines(alone, 0.5)
 
 
 # --- sides -----------------------------------------------------------------------------------------------
