@@ -166,8 +166,7 @@ def to_log(
     points, t = record.points, record.scan_t
     is_line = are_lines(points, spacing)
     if is_line:
-        scans = usable(points, notes).apart(len(t))
-        points = Points.joined(lines_of(t, scans, odometry, frames, spacing, notes))
+        points = lines_of(t, usable(points, notes), odometry, frames, spacing, notes)
     else:
         points = points.where(points.lines == ALONE)
         told = "points of polylines beside cones were left out (--spacing takes both as lines)"

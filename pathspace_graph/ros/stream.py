@@ -63,7 +63,7 @@ class MessageStream:
             points = points.where(points.lines < 0)  # polylines beside cones are decoration
             if (points.lines == DENSE).any():
                 points = usable(points, self.refused)
-                points = along_lines(points, default_spacing([points]))
+                points = along_lines(points, default_spacing(points))
             else:
                 points = distinct(points, self.refused)
             t = stamp_of(message) or received
