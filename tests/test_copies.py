@@ -17,7 +17,6 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT
 from pathspace_graph.loop.closed import Closed
 from pathspace_graph.loop.drive_record import DriveRecord
-from pathspace_graph.loop.lost import Lost
 from pathspace_graph.loop.map_repair import REPAIRED
 from pathspace_graph.loop.open import Open
 from pathspace_graph.mapping.road import Road
@@ -73,8 +72,7 @@ def state_of(held: _Before | FixedLagMapper) -> str:
 
 def met_in(mapper: FixedLagMapper, result: CycleResult) -> set[str]:
     """Return the name of the phase, and of what else a cycle has met."""
-    is_new_road = isinstance(mapper.phase, Lost) and mapper.phase.new_road is not None
-    met = {"batch": mapper.drive.solver.is_busy, "new road": is_new_road, "revisit": bool(mapper.revisits)}
+    met = {"batch": mapper.drive.solver.is_busy, "revisit": bool(mapper.revisits)}
     met["repaired"] = result.notice.startswith(REPAIRED)
     return {type(mapper.phase).__name__, *(name for name, is_met in met.items() if is_met)}
 
@@ -85,7 +83,7 @@ def met_in(mapper: FixedLagMapper, result: CycleResult) -> set[str]:
         (closing, {"Closed", "Open", "batch"}),
         (revisiting, {"Open", "revisit"}),
         slow(repairing, {"Closed", "Open", "batch", "repaired"}),
-        slow(losing, {"Closed", "Lost", "Open", "batch", "new road"}),
+        slow(losing, {"Closed", "Lost", "Open", "batch"}),
     ],
 )
 def test_a_copy_stays_as_it_is_whatever_the_original_does(make: Any, expected: set[str]) -> None:

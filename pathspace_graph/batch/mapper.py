@@ -31,7 +31,7 @@ from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE_LENGTHS
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import known_noise, vehicle_of, with_inflated_priors, with_size
-from pathspace_graph.mapping.orange import OrangeCones, Sighting
+from pathspace_graph.mapping.orange import Sighting, orange_cones
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict, solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
@@ -352,10 +352,12 @@ def _map_of_curves(few: Simplified, joint: Array, settings: MapperSettings) -> M
 
 def _orange(judged: JudgedLog, state: State) -> dict[int, PointBoundary]:
     settings, twists = judged.settings, judged.chain.twists
-    cones = OrangeCones(settings.growth, settings.spline.sigma_shape)
-    for k, detections in enumerate(judged.orange):
-        cones.add(Sighting(k, state.poses[k], twists[k], detections), state.variables.sensor)
-    return cones.points()
+    seen = [
+        Sighting(k, state.poses[k], twists[k], detections)
+        for k, detections in enumerate(judged.orange)
+        if len(detections.labels)
+    ]
+    return orange_cones(seen, state.variables.sensor, settings.growth, settings.spline.sigma_shape)
 
 
 def records_of(

@@ -76,7 +76,6 @@ class Search(Copyable):
         self._tried = road.smoother.times[-1]  # stamp of the last attempt (s)
         self._last: Motion | None = None  # result of the last attempt
         self._agreed = 0  # successive attempts with the same result
-        self._missed = 0  # successive attempts without an agreeing place
 
     def look(self, road: Road, classified: Classified, reading: Reading) -> None:
         """Store the newest cycle of a road, with detections corrected by the calibration."""
@@ -114,11 +113,6 @@ class Search(Copyable):
         seen = np.linalg.inv(found.covariance) - self._information
         return np.asarray(np.linalg.inv(seen / WIDENING**2 + self._information), np.float64)
 
-    @property
-    def is_off_map(self) -> bool:
-        """Whether no place of the map has agreed in successive attempts."""
-        return self._missed >= CONFIRMATIONS
-
     def _places(self, smoother: CurveSmoother) -> list[Place] | None:
         """Return the likeliest places, best first; None with too few detections."""
         seen = self._sightings()
@@ -133,12 +127,9 @@ class Search(Copyable):
 
     def by_score(self, places: list[Place] | None) -> RefinedMotion | None:
         """Return the motion onto a place that is clearly better than all others, if there is one."""
-        if places is None:
-            return None
         if not places or places[0].score < MIN_SCORE:
-            self._missed += 1
             return None
-        self._missed, best = 0, places[0]
+        best = places[0]
         rivals = [place.score for place in places if not place.is_near(best)]
         if rivals and rivals[0] > best.score - MARGIN:
             return None

@@ -14,13 +14,14 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.window import rows_on_poses
 from pathspace_graph.io.log import Detections
+from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
 from .growth import Growth
 from .motion import MeasuredMotion, predict
-from .orange import OrangeCones, Sighting
+from .orange import OrangeSightings, Sighting, orange_cones
 from .path import DrivenPath
 from .smoother import CurveSmoother, Gating
 
@@ -50,8 +51,8 @@ class Road:
         self.path = DrivenPath()
         self.growth = Growth(settings.growth)
         """Tentative tracks, through which the open curves grow."""
-        self.orange = OrangeCones(settings.growth, settings.spline.sigma_shape)
-        """Orange cones, which are points of the map."""
+        self.orange = OrangeSightings()
+        """Detections of orange cones, which are points of the map."""
         self.grown: frozenset[int] = frozenset()
         """Curves that grew in the newest cycle; the next one tests the whole window for them."""
         self._attach()
@@ -80,11 +81,10 @@ class Road:
         return rows_on_poses(factors, self.smoother.variables, self.next_cycle - 1)
 
     def predict(self, motion: MeasuredMotion, orange: Detections) -> None:
-        """Add the pose of a cycle by the calibrated odometry, extend the path, and place the orange cones."""
+        """Add the pose of a cycle by the calibrated odometry, extend the path, and keep the orange cones."""
         predict(self.smoother, self.path, motion, orange.t)
         cycle, pose = self.smoother.next_cycle - 1, self.poses[-1].copy()
-        seen = Sighting(cycle, pose, motion.odometry.twist, orange)
-        self.orange.add(seen, self.smoother.variables.sensor)
+        self.orange.add(Sighting(cycle, pose, motion.odometry.twist, orange))
 
     def classify(self, detections: Detections, twist: Array, *, use: bool = True) -> Classified:
         """Add the detections of the newest pose, and use the ones that a curve explains.
@@ -149,9 +149,15 @@ class Road:
         return int(detections.used[detections.cycle.searchsorted(self.next_cycle - 1) :].sum())
 
     def place_orange(self, corrected: Array) -> None:
-        """Place the orange cones again, by corrected poses (k, 3) of the first cycles and the window's."""
-        window = self.smoother.first_cycle, self.poses
-        self.orange.place_again(self.smoother.variables.sensor, (0, corrected), window)
+        """Place the detections of orange cones by corrected poses (k, 3) of the first cycles."""
+        self.orange.place((0, corrected))
+
+    def orange_cones(self) -> dict[int, PointBoundary]:
+        """Merge the orange cones by label, with the present poses of the window."""
+        window = (self.smoother.first_cycle, self.poses)
+        seen = [one.placed_by([window]) for one in self.orange.newest]
+        growth, shape = self.settings.growth, self.settings.spline.sigma_shape
+        return orange_cones(seen, self.smoother.variables.sensor, growth, shape)
 
     def move(self, motion: Array) -> None:
         """Move path, tracks and cones, which are no variables, by a rigid motion (3,) of the map frame."""

@@ -19,7 +19,7 @@ from pathspace_graph.mapping.motion import vehicle_state
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.run import Readings
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.ahead import TrackAhead, check_line
+from pathspace_graph.spline.ahead import TrackAhead, check_line, track_ahead
 from pathspace_graph.spline.boundary import Boundary
 
 from .gtsam_graph import window_graph
@@ -60,13 +60,13 @@ class MapperEstimate:
         """Return the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
 
         The call is fast enough for a controller in each cycle. While the loop is open, the line continues
-        past the confirmed ends through the cones of `outline`, and says where. While the vehicle is lost on a
-        closed map, the line is the road mapped since then. SettingsError is raised for a length out of its
-        range.
+        past the confirmed ends through the cones of `outline`, and says where. There is none while the
+        vehicle is lost. SettingsError is raised for a length out of its range.
         """
         check_line(distance, step)
-        new_road = self.phase.new_road if isinstance(self.phase, Lost) else None
-        return track_ahead_of(new_road or self.road, distance, step)
+        if isinstance(self.phase, Lost):
+            return track_ahead({}, self.road.poses[-1], distance, step)
+        return track_ahead_of(self.road, distance, step)
 
     def looked_at(self) -> AbstractContextManager[None]:
         """Return a context in which no query changes the estimate.

@@ -23,7 +23,7 @@ def map_of(road: Road, sigma_size: float) -> Map:
     includes the scatter of the cones about it.
     """
     with road.smoother.variables.looked_at():
-        return replace(_map_of(road, sigma_size), points=road.orange.points())
+        return replace(_map_of(road, sigma_size), points=road.orange_cones())
 
 
 def _map_of(road: Road, sigma_size: float) -> Map:
@@ -57,7 +57,7 @@ def outline_of(road: Road) -> Map:
             label: SplineBoundary(outlook.spline, NO_COVARIANCE, outlook.confirmed_until)
             for label, outlook in _outlooks(road).items()
         }
-    return Map(road.closed, boundaries, points=road.orange.points())
+    return Map(road.closed, boundaries, points=road.orange_cones())
 
 
 def _outlooks(road: Road) -> dict[int, Outlook]:

@@ -1,6 +1,9 @@
-"""Orange cones: points that are merged in each pass; the best pass says which stand at a place."""
+"""Orange cones: a place has as many as its cycles detect together."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,14 +11,14 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Detections
+from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.labels import BIG_ORANGE, ORANGE
-from pathspace_graph.mapping.orange import OrangeCones, Sighting
+from pathspace_graph.mapping.orange import OrangeSightings, Sighting, orange_cones
 from pathspace_graph.settings.online import GrowthSettings
 
-from ..oracles.copied import copied
-from ..scenes.digest import digest
-
 Array = NDArray[np.float64]
+
+NOTHING = np.zeros(0)  # a sensor without errors
 
 SETTINGS = GrowthSettings(sightings=3, merge_radius=1.0, forget_after=6.0)
 
@@ -30,72 +33,56 @@ def seen_from(pose: Array, cycle: int) -> Sighting:
     return Sighting(cycle, pose, np.zeros(3), detections)
 
 
+def merged(sightings: Sequence[Sighting], sensor: Array = NOTHING) -> dict[int, PointBoundary]:
+    return orange_cones(sightings, sensor, SETTINGS, 0.1)
+
+
 def test_orange_cones_are_points_once_they_were_seen_often_enough() -> None:
-    cones = OrangeCones(SETTINGS, 0.1)
-    for cycle in range(2):
-        cones.add(seen_from(np.array([cycle, 0.0, 0.1 * cycle]), cycle), np.zeros(0))
-    assert cones.points() == {}
-    cones.add(seen_from(np.array([2.0, 0.0, 0.2]), 2), np.zeros(0))
-    found = cones.points()
-    np.testing.assert_allclose(found[BIG_ORANGE].points, CONES[:2], atol=1e-12)
+    seen = [seen_from(np.array([cycle, 0.0, 0.1 * cycle]), cycle) for cycle in range(3)]
+    assert merged([]) == merged(seen[:2]) == {}
+    found = merged(seen)
+    np.testing.assert_allclose(
+        sorted(found[BIG_ORANGE].points.tolist()), sorted(CONES[:2].tolist()), atol=1e-12
+    )
     np.testing.assert_allclose(found[ORANGE].points, CONES[2:], atol=1e-12)
     np.testing.assert_allclose(found[ORANGE].covariance, (1.15 * 0.04 / 3 + 0.01) * np.eye(2), atol=1e-12)
 
 
-def test_orange_cones_are_placed_again_where_poses_were_corrected() -> None:
+def test_orange_cones_are_placed_by_corrected_poses() -> None:
     """The drive had drifted by a metre in its last two cycles, and its heading by 0.1 rad."""
-    cones, wrong = OrangeCones(SETTINGS, 0.1), np.array([0.0, 1.0, 0.1])
+    cones, wrong = OrangeSightings(), np.array([0.0, 1.0, 0.1])
     true = [np.array([cycle, 0.0, 0.0]) for cycle in range(4)]
     for cycle, pose in enumerate(true):
-        believed = pose + wrong * (cycle >= 2)
-        sighting = seen_from(pose, cycle)
-        cones.add(Sighting(cycle, believed, sighting.twist, sighting.detections), np.zeros(0))
-    cones.place_again(np.zeros(0), (2, np.array(true[2:])))
-    np.testing.assert_allclose(cones.points()[BIG_ORANGE].points, CONES[:2], atol=1e-12)
+        cones.add(replace(seen_from(pose, cycle), pose=pose + wrong * (cycle >= 2)))
+    before = cones.copy()
+    cones.place((2, np.array(true[2:])))
+    np.testing.assert_allclose(merged(cones.newest)[ORANGE].points, CONES[2:], atol=1e-12)
+    np.testing.assert_array_equal(before.newest[3].pose, true[3] + wrong)  # a copy stays as it was
 
 
 def test_orange_cones_move_with_the_map_behind_the_vehicle() -> None:
-    cones, motion = OrangeCones(SETTINGS, 0.1), np.array([1.0, 2.0, 0.5 * np.pi])
+    cones, motion = OrangeSightings(), np.array([1.0, 2.0, 0.5 * np.pi])
     for cycle in range(3):
-        cones.add(seen_from(np.zeros(3), cycle), np.zeros(0))
+        cones.add(seen_from(np.zeros(3), cycle))
     cones.move(motion)
-    np.testing.assert_allclose(cones.points()[ORANGE].points, [[1.0, 10.0]], atol=1e-12)
-    cones.place_again(np.zeros(0), (7, np.zeros((0, 3))))  # their poses have moved as well
-    np.testing.assert_allclose(cones.points()[ORANGE].points, [[1.0, 10.0]], atol=1e-12)
+    np.testing.assert_allclose(merged(cones.newest)[ORANGE].points, [[1.0, 10.0]], atol=1e-12)
+    cones.place((7, np.zeros((0, 3))))  # nothing is known of their cycles
+    np.testing.assert_allclose(merged(cones.newest)[ORANGE].points, [[1.0, 10.0]], atol=1e-12)
 
 
 def test_errors_of_the_sensor_are_taken_out_of_orange_cones() -> None:
     """Ranges are a tenth too long, to first order."""
-    cones, sensor = OrangeCones(SETTINGS, 0.1), np.array([0.0, 0.0, 0.0, 0.1, 0.0])
-    for cycle in range(3):
-        cones.add(seen_from(np.zeros(3), cycle), sensor)
-    np.testing.assert_allclose(cones.points()[ORANGE].points, [[7.2, 0.0]], atol=1e-12)
+    seen = [seen_from(np.zeros(3), cycle) for cycle in range(3)]
+    found = merged(seen, np.array([0.0, 0.0, 0.0, 0.1, 0.0]))
+    np.testing.assert_allclose(found[ORANGE].points, [[7.2, 0.0]], atol=1e-12)
 
 
 def test_only_the_newest_sightings_of_orange_cones_are_remembered() -> None:
-    cones = OrangeCones(SETTINGS, 0.1)
-    for cycle in range(OrangeCones.MOST + 20):
-        cones.add(seen_from(np.zeros(3), cycle), np.zeros(0))
-    assert len(cones._sightings) == OrangeCones.MOST
-    assert cones._sightings[-1].cycle == OrangeCones.MOST + 19
-
-
-def test_a_copy_of_orange_cones_stays_as_it_is_and_goes_on_as_the_original() -> None:
-    """Nothing that happens to the original shows in a copy: more detections, a motion, and new poses."""
-    cones, pose = OrangeCones(SETTINGS, 0.1), np.array([0.5, 0.0, 0.1])
-    for cycle in range(3):
-        cones.add(seen_from(np.zeros(3), cycle), np.zeros(0))
-    for happens in (
-        lambda cones: cones.add(seen_from(pose, 100), np.zeros(0)),  # a second pass
-        lambda cones: cones.move(np.array([1.0, 2.0, 0.3])),
-        lambda cones: cones.place_again(np.zeros(0), (1, pose + np.zeros((1, 3)))),
-        lambda cones: cones.add(seen_from(pose, 101), np.zeros(0)),
-    ):
-        twin, expected = cones.copy(), copied(cones)
-        happens(cones)
-        assert digest(twin) == digest(expected)
-        happens(twin)
-        assert digest(twin) == digest(cones)
+    cones = OrangeSightings()
+    for cycle in range(OrangeSightings.MOST + 20):
+        cones.add(seen_from(np.zeros(3), cycle))
+    assert len(cones.newest) == OrangeSightings.MOST
+    assert cones.newest[-1].cycle == OrangeSightings.MOST + 19
 
 
 def gate(spacing: float) -> Array:
@@ -103,41 +90,65 @@ def gate(spacing: float) -> Array:
     return np.array([[x, y] for x in (0.0, spacing) for y in (2.0, -2.0)])
 
 
-def driven_by(cones: OrangeCones, truth: Array, drifts: list[float], sigmas: tuple[float, float]) -> None:
-    """Detect cones in passes whose poses have drifted along the road, with errors along and across it."""
-    rng, cycle, count = np.random.default_rng(3), 0, len(truth)
+def driven_by(
+    truth: Array, drifts: list[float], sigmas: tuple[float, float], told: float = 1.0
+) -> list[Sighting]:
+    """Detect cones in passes whose poses have drifted along the road, each with a chance of `told`."""
+    rng, found, count = np.random.default_rng(3), list[Sighting](), len(truth)
     for number, drift in enumerate(drifts):
         slow = rng.normal(0.0, 0.3, truth.shape) * sigmas
         for k in range(20):
             points = truth + slow + rng.normal(0.0, 1.0, truth.shape) * sigmas
             points[:, 0] += 10.0 + drift
             covariances = np.tile(np.diag(np.square(sigmas)), (count, 1, 1))
-            seen = Detections(20.0 * number + 0.2 * k, points, covariances, np.full(count, BIG_ORANGE))
-            cones.add(Sighting(cycle, np.array([-10.0, 0.0, 0.0]), np.zeros(3), seen), np.zeros(0))
-            cycle += 1
+            cycle = Detections(20.0 * number + 0.2 * k, points, covariances, np.full(count, BIG_ORANGE))
+            cycle = cycle.where(rng.random(count) < told)
+            found.append(Sighting(len(found), np.array([-10.0, 0.0, 0.0]), np.zeros(3), cycle))
+    return found
 
 
 @pytest.mark.parametrize("spacing", [0.8, 1.0, 1.5])
 @pytest.mark.parametrize("sigmas", [(0.05, 0.05), (0.15, 0.15), (0.2, 0.2), (0.35, 0.1)])
+@pytest.mark.parametrize("told", [1.0, 0.85])
 def test_a_gate_of_pairs_has_four_cones_however_often_it_is_passed(
-    spacing: float, sigmas: tuple[float, float]
+    spacing: float, sigmas: tuple[float, float], told: float
 ) -> None:
-    """The vehicle's place drifts by up to 0.9 m from pass to pass, more than the cones are apart."""
-    cones = OrangeCones(GrowthSettings(), 0.1)
-    driven_by(cones, gate(spacing), [0.0, 0.5, -0.4, 0.2], sigmas)
-    found = cones.points()[BIG_ORANGE].points
+    """A fifth of a metre of drift from pass to pass is what a localized vehicle has at most."""
+    seen = driven_by(gate(spacing), [0.0, 0.2, -0.2, 0.1], sigmas, told)
+    found = orange_cones(seen, NOTHING, GrowthSettings(), 0.1)[BIG_ORANGE].points
     assert len(found) == 4
-    off = (found - found.mean(axis=0))[:, None] - (gate(spacing) - gate(spacing).mean(axis=0))
-    apart = np.hypot(off[..., 0], off[..., 1])
-    assert sorted(apart.argmin(axis=1).tolist()) == [0, 1, 2, 3]  # each of the four is there, by their shape
+    apart = np.hypot(*(found[:, None] - gate(spacing)).transpose(2, 0, 1))
+    assert sorted(apart.argmin(axis=1).tolist()) == [0, 1, 2, 3]
     assert (apart.min(axis=1) < 0.1 + sigmas[0]).all()
 
 
+def test_a_cone_that_is_detected_twice_now_and_then_is_one() -> None:
+    seen = driven_by(gate(1.0), [0.0], (0.1, 0.1))
+    for k in range(0, 20, 3):
+        twice = seen[k].detections
+        seen[k] = replace(seen[k], detections=twice.with_others(twice.where(np.arange(4) < 1)))
+    assert len(orange_cones(seen, NOTHING, GrowthSettings(), 0.1)[BIG_ORANGE].points) == 4
+
+
+def test_cones_along_a_lane_are_places_of_their_own() -> None:
+    """The vehicle passes ten cones that are 3 m apart, and sees those from 2 to 12 m ahead."""
+    rng, lane, seen = np.random.default_rng(0), 3.0 * np.arange(10.0), list[Sighting]()
+    for cycle in range(60):
+        x = 0.5 * cycle - 5.0
+        ahead = lane[(lane > x + 2.0) & (lane < x + 12.0)] - x
+        points = np.column_stack([ahead, np.ones(len(ahead))]) + rng.normal(0.0, 0.1, (len(ahead), 2))
+        covariances = np.tile(0.01 * np.eye(2), (len(ahead), 1, 1))
+        detections = Detections(0.1 * cycle, points, covariances, np.full(len(ahead), ORANGE))
+        seen.append(Sighting(cycle, np.array([x, 0.0, 0.0]), np.zeros(3), detections))
+    found = orange_cones(seen, NOTHING, GrowthSettings(), 0.1)[ORANGE].points
+    np.testing.assert_allclose(np.sort(found[:, 0]), lane, atol=0.1)
+
+
 def test_a_false_cone_of_a_few_vague_detections_is_no_point() -> None:
-    cones = OrangeCones(GrowthSettings(), 0.1)
+    cones = []
     for cycle in range(4):
         seen = Detections(
             0.2 * cycle, np.array([[30.0, 1.0]]), 0.9**2 * np.eye(2)[None], np.array([BIG_ORANGE])
         )
-        cones.add(Sighting(cycle, np.zeros(3), np.zeros(3), seen), np.zeros(0))
-    assert cones.points() == {}  # 0.45 m and more, where 0.4 m are asked for
+        cones.append(Sighting(cycle, np.zeros(3), np.zeros(3), seen))
+    assert merged(cones) == {}
