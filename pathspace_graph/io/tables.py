@@ -68,7 +68,8 @@ def read_table(
 
 def read_tum(file: Path) -> Table:
     """Read a trajectory in the TUM format as a table; comments and empty lines are tolerated."""
-    frame = _read_csv(file, read_text(file, "a trajectory"), len(TUM), sep=r"\s+", comment="#")
+    text = re.sub(r"(?m)^[ \t]*#.*$", "", read_text(file, "a trajectory"))
+    frame = _read_csv(file, text, len(TUM), sep=r"\s+")
     columns = {name: frame[k].to_numpy() for k, name in enumerate(TUM)}
     table = Table(file, columns, frame.index.to_numpy(), TUM)
     table.require((frame[len(TUM)] == "").to_numpy(), f"expected {len(TUM)} numbers, found more")
@@ -87,6 +88,10 @@ def _read_csv(file: Path, text: str, width: int, **form: Any) -> pd.DataFrame:
 
     There is one column more than the width, which shows rows that are too long.
     """
+    if "\0" in text:  # some versions of pandas end a field there
+        raise InputError(
+            file, "expected a table of texts, found a zero byte", text.count("\n", 0, text.index("\0")) + 1
+        )
     form |= {"header": None, "names": range(width + 1), "index_col": False, "dtype": object}
     try:
         frame = pd.read_csv(StringIO(text), keep_default_na=False, skip_blank_lines=False, **form)

@@ -29,8 +29,8 @@ def test_a_comment_is_left_out_and_a_wrong_row_is_named(tmp_path: Path) -> None:
     file = tmp_path / "t.tum"
     file.write_text("# t tx ty tz qx qy qz qw\n\n0 1 2 0 0 0 0 1\n")
     np.testing.assert_array_equal(read_trajectory(file)[1], [[1.0, 2.0, 0.0]])
-    file.write_text("0 1 2 0 0 0 0 1\n0.1 inf 2 0 0 0 0 1\n")
-    with pytest.raises(InputError, match="row 2: expected a finite number in column 'tx'"):
+    file.write_text("# t tx ty\n0 1 2 0 0 0 0 1\n\n0.1 inf 2 0 0 0 0 1\n")
+    with pytest.raises(InputError, match="row 4: expected a finite number in column 'tx'"):
         read_trajectory(file)
     with pytest.raises(InputError, match=r"none\.tum: expected a trajectory"):
         read_trajectory(tmp_path / "none.tum")
