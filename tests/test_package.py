@@ -111,6 +111,12 @@ def test_help_waits_for_no_heavy_library(command: str) -> None:
     assert ("numpy" in loaded) == (command in ("simulate", "convert"))
 
 
+def test_an_estimator_does_not_wait_for_what_reads_files() -> None:
+    homes = ("online.fixed_lag", "batch.mapper", "loop.worker", "ros.node", "sim.simulate")
+    loaded = modules_after(f"import {', '.join(f'pathspace_graph.{home}' for home in homes)}")
+    assert not loaded & {"pandas", "pathspace_graph.io.tables"}
+
+
 def test_a_wrong_usage_waits_for_no_library_either() -> None:
     loaded = modules_after("from pathspace_graph.cli import main; main(['online', 'LOG', '--lag', 'x'])")
     assert not loaded & {"numpy", "gtsam", "rich", "docstring_parser"}

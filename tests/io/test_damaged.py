@@ -19,6 +19,7 @@ from pathspace_graph.eval.experiment.runner import read_record, write_record
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.io.log import COLUMNS
 from pathspace_graph.io.log_files import read_log, write_log
+from pathspace_graph.io.map import read_map
 from pathspace_graph.io.parsing import is_number
 from pathspace_graph.io.results import CYCLE_COLUMNS, write_result
 from pathspace_graph.io.tables import TUM
@@ -94,6 +95,25 @@ def test_rubbish_in_any_cell_is_refused_with_file_and_row(
     assert said.getvalue().startswith(f"pathspace-graph: {written / table.file}, row {at}: expected ")
     assert said.getvalue().count("\n") == 1
     assert not [path for path in written.iterdir() if path.name.startswith(("out", "."))]
+
+
+@settings(max_examples=400, deadline=None)
+@given(
+    name=st.sampled_from(("log/log.toml", "map/map.json")), at=st.integers(0, 9999), mask=st.integers(1, 255)
+)
+def test_a_flipped_byte_of_a_header_or_a_map_is_read_or_refused(
+    name: str, at: int, mask: int, written: Path
+) -> None:
+    file = written / name
+    good = file.read_bytes()
+    at %= len(good)
+    file.write_bytes(good[:at] + bytes([good[at] ^ mask]) + good[at + 1 :])
+    try:
+        read_log(file.parent) if file.suffix == ".toml" else read_map(file)
+    except InputError as error:
+        assert error.file == file and "\n" not in str(error)
+    finally:
+        file.write_bytes(good)
 
 
 @pytest.mark.parametrize("name", ["log.toml", *COLUMNS])
