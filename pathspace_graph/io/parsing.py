@@ -166,6 +166,7 @@ def typed(value: Any, kind: type[T], file: Path, where: str = "", *, strict: boo
 
 # --- tables ------------------------------------------------------------------------------------------------
 
+LABEL: Final = "label"  # column of words
 MISSING: Final = frozenset({"", "nan", "na", "n/a", "none", "null", "-"})  # words for no number
 
 
@@ -209,7 +210,7 @@ class Table:
 
         With `missing`, a number may be missing, as in `MISSING`, or not be finite; NaN stands for both.
         """
-        values, (declared, unit) = self._parsed(name, missing), self.declared.get(name, Column())
+        values, (declared, unit) = self.parsed(name, missing=missing), self.declared.get(name, Column())
         known, most = np.isfinite(values), largest or declared
         for good, expected in (
             (known | missing, "a finite number"),
@@ -219,7 +220,8 @@ class Table:
             self.require(good, f"expected {expected} in column '{name}', {found}")
         return np.where(known, values, np.nan)
 
-    def _parsed(self, name: str, missing: bool) -> Array:
+    def parsed(self, name: str, *, missing: bool = False) -> Array:
+        """Column as numbers (rows,), which may not be finite."""
         if name not in self.columns:
             found = shown(",".join(self.columns))
             raise InputError(self.file, f"expected a column '{name}', found none in {found}", 1)

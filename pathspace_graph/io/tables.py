@@ -1,8 +1,9 @@
 """CSV files and trajectories in the TUM format, read by pandas."""
 
 import re
-from collections.abc import Mapping, Sequence
-from io import StringIO
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ import pandas as pd
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array
 
-from .parsing import MAX_FILE_BYTES, MAX_STAMP, Column, Table, read_text, shown
+from .parsing import LABEL, MAX_FILE_BYTES, MAX_STAMP, Column, Table, read_text, shown
 
 DELIMITERS: Final = ",;\t"  # of CSV files of other programs
 TUM: Final[dict[str, Column]] = {
@@ -20,6 +21,7 @@ TUM: Final[dict[str, Column]] = {
     **dict.fromkeys(("tx", "ty", "tz"), Column(unit="m")),
     **dict.fromkeys(("qx", "qy", "qz", "qw"), Column()),
 }
+CHUNK: Final = 50_000  # number of rows whose texts are in memory at a time
 _DECIMAL_COMMA: Final = r"^\s*([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)\s*$"
 
 
@@ -43,37 +45,54 @@ def read_table(
     first = re.search(r"\S[^\r\n]*", text)
     delimiter = max(delimiters, key=first[0].count) if first else ","
     count = first[0].count(delimiter) + 1 if first else 1
-    frame = _read_csv(file, text, count, sep=delimiter, skipinitialspace=True)
+    frames = _read_csv(file, text, count, sep=delimiter, skipinitialspace=True)
     if delimiter != ",":
-        frame = frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
+        frames = (frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True) for frame in frames)
+    begin = next(frames)
     row, names = 1, [*header]
     if not header:
-        if frame.empty:
+        if begin.empty:
             raise InputError(file, f"expected a header {','.join(required)}, found an empty file", 1)
-        row, names = int(frame.index[0]), [name.strip() for name in frame.iloc[0]]
+        row, names = int(begin.index[0]), [name.strip() for name in begin.iloc[0]]
         names[0] = names[0].removeprefix(comment).strip()
-        frame = frame.iloc[1:]
+        begin = begin.iloc[1:]
     width = max((k + 1 for k, name in enumerate(names) if name), default=0)
     for name in required:
         if names.count(name) != 1:
             found = f"{'more than one' if name in names else 'none'} in {shown(','.join(names[:width]))}"
             raise InputError(file, f"expected a column '{name}', found {found}", row)
-    columns = {name: frame[k].to_numpy() for k, name in enumerate(names[:width])}
-    declared = required if isinstance(required, Mapping) else {}
-    table = Table(file, columns, frame.index.to_numpy(), declared)
-    is_long = (frame.iloc[:, width:] != "").any(axis=1).to_numpy()
-    table.require(~is_long, f"expected {width} fields, found more")
-    return table
+    return _table(file, chain([begin], frames), names[:width], required)
 
 
 def read_tum(file: Path) -> Table:
     """Read a trajectory in the TUM format as a table; comments and empty lines are tolerated."""
     text = re.sub(r"(?m)^[ \t]*#.*$", "", read_text(file, "a trajectory"))
-    frame = _read_csv(file, text, len(TUM), sep=r"\s+")
-    columns = {name: frame[k].to_numpy() for k, name in enumerate(TUM)}
-    table = Table(file, columns, frame.index.to_numpy(), TUM)
-    table.require((frame[len(TUM)] == "").to_numpy(), f"expected {len(TUM)} numbers, found more")
-    return table
+    return _table(file, _read_csv(file, text, len(TUM), sep=r"\s+"), [*TUM], TUM)
+
+
+def _table(
+    file: Path,
+    frames: Iterable[pd.DataFrame],
+    names: Sequence[str],
+    required: Mapping[str, Column] | Sequence[str],
+) -> Table:
+    """Table of named columns: all of them as texts, or the declared ones, as numbers but for labels.
+
+    Numbers take a tenth of the memory of their texts, of which there are those of a frame at a time.
+    """
+    declared = required if isinstance(required, Mapping) else {}
+    parts: dict[str, list[Any]] = {name: [] for name in declared or names}
+    rows = list[Any]()
+    for frame in frames:
+        columns = {name: frame[k].to_numpy() for k, name in enumerate(names)}
+        table = Table(file, columns, frame.index.to_numpy(), declared)
+        is_long = (frame.iloc[:, len(names) :] != "").any(axis=1).to_numpy()
+        table.require(~is_long, f"expected {len(names)} fields, found more")
+        rows.append(table.rows)
+        for name, part in parts.items():
+            part.append(table.parsed(name) if name in declared and name != LABEL else columns[name])
+    joined = {name: np.concatenate(part) for name, part in parts.items()}
+    return Table(file, joined, np.concatenate(rows), declared)
 
 
 def read_trajectory(file: Path) -> tuple[Array, Array]:
@@ -83,26 +102,26 @@ def read_trajectory(file: Path) -> tuple[Array, Array]:
     return values[:, 0], np.column_stack([values[:, 1:3], theta])
 
 
-def _read_csv(file: Path, text: str, width: int, **form: Any) -> pd.DataFrame:
-    """Fields of the rows that are not empty, by their number in the file.
+def _read_csv(file: Path, text: str, width: int, **form: Any) -> Iterator[pd.DataFrame]:
+    """Yield fields of the rows that are not empty, by their number in the file; at least one frame.
 
     There is one column more than the width, which shows rows that are too long.
     """
     if "\0" in text:  # some versions of pandas end a field there
-        raise InputError(
-            file, "expected a table of texts, found a zero byte", text.count("\n", 0, text.index("\0")) + 1
-        )
+        zero = text.count("\n", 0, text.index("\0")) + 1
+        raise InputError(file, "expected a table of texts, found a zero byte", zero)
     form |= {"header": None, "names": range(width + 1), "index_col": False, "dtype": object}
+    form |= {"keep_default_na": False, "skip_blank_lines": False, "chunksize": CHUNK}
     try:
-        frame = pd.read_csv(StringIO(text), keep_default_na=False, skip_blank_lines=False, **form)
+        for frame in pd.read_csv(BytesIO(text.encode()), **form):
+            begins_empty = frame[frame[0] == ""]
+            kept = frame.drop(begins_empty.index[(begins_empty == "").all(axis=1)])
+            yield kept.set_axis(kept.index + 1)
+        if not text:
+            yield pd.DataFrame(columns=range(width + 1), dtype=object)
     except pd.errors.ParserError as error:
         told = str(error).strip()
         if long := re.search(r"in line (\d+), saw (\d+)", told):
             raise InputError(file, f"expected {width} fields, found {long[2]}", int(long[1])) from None
-        row = re.search(r"at row (\d+)", told)  # from 0
-        raise InputError(
-            file, f"expected a table of texts: {told}", int(row[1]) + 1 if row else None
-        ) from None
-    frame = frame.set_axis(frame.index + 1)
-    begins_empty = frame[frame[0] == ""]
-    return frame.drop(begins_empty.index[(begins_empty == "").all(axis=1)])
+        row = int(found[1]) + 1 if (found := re.search(r"at row (\d+)", told)) else None
+        raise InputError(file, f"expected a table of texts: {told}", row) from None
