@@ -14,9 +14,11 @@ from threadpoolctl import threadpool_info
 
 def made() -> dict[str, str]:
     """Commit, or version outside a repository, machine and date of what this package makes now."""
-    commit = commit_of(Path(__file__).parent) or version("pathspace-graph")
-    named = machine()
+    folder, named = Path(__file__).parent, machine()
+    installed = {"site-packages", "dist-packages"} & {*folder.parts}  # a repository around it is another one
+    commit = "" if installed else commit_of(folder)
     parts = (named["host"], named["processor"], named["blas"])
+    commit = commit or f"version {version('pathspace-graph')}"
     return {"commit": commit, "machine": ", ".join(filter(None, parts)), "date": now()}
 
 
