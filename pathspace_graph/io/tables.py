@@ -45,7 +45,7 @@ def read_table(
     first = re.search(r"\S[^\r\n]*", text)
     delimiter = max(delimiters, key=first[0].count) if first else ","
     count = first[0].count(delimiter) + 1 if first else 1
-    frames = _read_csv(file, text, count, sep=delimiter, skipinitialspace=True)
+    frames = _read_csv(file, text, count, delimiter)
     if delimiter != ",":
         frames = (frame.replace(_DECIMAL_COMMA, r"\1.\2", regex=True) for frame in frames)
     begin = next(frames)
@@ -67,7 +67,7 @@ def read_table(
 def read_tum(file: Path) -> Table:
     """Read a trajectory in the TUM format as a table; comments and empty lines are tolerated."""
     text = re.sub(r"(?m)^[ \t]*#.*$", "", read_text(file, "a trajectory"))
-    return _table(file, _read_csv(file, text, len(TUM), sep=r"\s+"), [*TUM], TUM)
+    return _table(file, _read_csv(file, text, len(TUM), r"\s+"), [*TUM], TUM)
 
 
 def _table(
@@ -102,20 +102,35 @@ def read_trajectory(file: Path) -> tuple[Array, Array]:
     return values[:, 0], np.column_stack([values[:, 1:3], theta])
 
 
-def _read_csv(file: Path, text: str, width: int, **form: Any) -> Iterator[pd.DataFrame]:
+def _read_csv(file: Path, text: str, width: int, delimiter: str) -> Iterator[pd.DataFrame]:
     """Yield fields of the rows that are not empty, by their number in the file; at least one frame.
 
-    There is one column more than the width, which shows rows that are too long.
+    There is one column more than the width, which shows rows that are too long. Of a short one pandas fills
+    the end with empty fields; where no text has quotes, its line tells.
     """
+    lines, has_lines = list[str](), '"' not in text and len(delimiter) == 1
     if "\0" in text:  # some versions of pandas end a field there
         zero = text.count("\n", 0, text.index("\0")) + 1
         raise InputError(file, "expected a table of texts, found a zero byte", zero)
-    form |= {"header": None, "names": range(width + 1), "index_col": False, "dtype": object}
-    form |= {"keep_default_na": False, "skip_blank_lines": False, "chunksize": CHUNK}
     try:
-        for frame in pd.read_csv(BytesIO(text.encode()), **form):
+        for frame in pd.read_csv(
+            BytesIO(text.encode()),
+            sep=delimiter,
+            header=None,
+            names=range(width + 1),
+            index_col=False,
+            dtype=object,
+            keep_default_na=False,
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            chunksize=CHUNK,
+        ):
             begins_empty = frame[frame[0] == ""]
             kept = frame.drop(begins_empty.index[(begins_empty == "").all(axis=1)])
+            for row in kept.index[kept[width - 1] == ""] if has_lines else ():
+                lines = lines or re.split(r"\r\n?|\n", text)
+                if (found := lines[row].count(delimiter) + 1) < width:
+                    raise InputError(file, f"expected {width} fields, found {found}", row + 1)
             yield kept.set_axis(kept.index + 1)
         if not text:
             yield pd.DataFrame(columns=range(width + 1), dtype=object)
