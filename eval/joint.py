@@ -11,7 +11,6 @@ from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.estimators import DEFAULT_BATCH, make_batch
 from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.moved import moved_run
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
@@ -58,7 +57,7 @@ def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) 
     if len(logs) > 1:
         joint = join(mapped)
         first, mapped = next(iter(joint.drives)), joint.drives
-        own = {name: moved_run(drive, inverse(joint.frames[name])) for name, drive in mapped.items()}
+        own = {name: drive.moved(inverse(joint.frames[name])) for name, drive in mapped.items()}
     track, truths = mapped[first].map, {name: truth_of(logs[name]) for name in mapped}
     errors = [trajectory_errors(own[name].trajectory_t, own[name].trajectory, truths[name]) for name in own]
     return {

@@ -17,7 +17,8 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.front_end.front_end import seen_cycles
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, read_map
-from pathspace_graph.io.results import TRAJECTORY_FILE, read_trajectory
+from pathspace_graph.io.results import TRAJECTORY_FILE
+from pathspace_graph.io.tables import read_trajectory
 
 from .experiment.cells import EstimatorCell
 from .experiment.run import make_plan, run_records

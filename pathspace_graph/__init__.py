@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     from pathspace_graph.baselines.landmark_batch import LandmarkBatch
     from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
     from pathspace_graph.batch.mapper import BatchMapper
-    from pathspace_graph.io.log import Detections, Log, Odometry, read_log, write_log
+    from pathspace_graph.io.log import Detections, Log, Odometry
+    from pathspace_graph.io.log_files import read_log, write_log
     from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, read_map
     from pathspace_graph.io.results import CycleRecord, RunResult, write_result
     from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -41,7 +42,8 @@ _HOMES = {
     "errors": ("InputError", "OutputError", "PathspaceError", "ReadingError", "SettingsError", "SolveError"),
     "estimators": ("make_batch", "make_online"),
     "frames": ("read_cycles", "read_study"),
-    "io.log": ("Detections", "Log", "Odometry", "read_log", "write_log"),
+    "io.log": ("Detections", "Log", "Odometry"),
+    "io.log_files": ("read_log", "write_log"),
     "io.map": ("Map", "PointBoundary", "SplineBoundary", "read_map"),
     "io.results": ("CycleRecord", "RunResult", "write_result"),
     "labels": ("LEFT", "RIGHT"),

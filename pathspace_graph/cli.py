@@ -58,7 +58,7 @@ GROUPS: Final = {
     },
 }
 EXTRAS: Final = {  # packages that the core does without, and the extra that has them
-    **dict.fromkeys(("pandas", "tabulate", "matplotlib"), "eval"),
+    **dict.fromkeys(("tabulate", "matplotlib"), "eval"),
     "distributed": "cluster",
 }
 COMMANDS: Final = {name: command for group in GROUPS.values() for name, command in group.items()}

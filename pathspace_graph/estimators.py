@@ -159,6 +159,7 @@ def check_batch(name: str) -> None:
 def make_online(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> OnlineEstimator:
     """Return an online estimator for a log, which tells the kind of detections and their noise."""
     check_online(name)
+    check_type("log", log, Log)
     own = parameters or parameters_of(name)
     made: OnlineEstimator = _make(ONLINE[name], settings_of(settings, log), log.noise, own)
     return made

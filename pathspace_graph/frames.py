@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Final
 
 import pandas as pd
 
-from pathspace_graph.io.parsing import MAX_STAMP, Table, read_table
+from pathspace_graph.io.parsing import MAX_STAMP, Table
 from pathspace_graph.io.results import CYCLE_COLUMNS, CYCLES_FILE, RunResult
+from pathspace_graph.io.tables import read_table
 
 from .errors import InputError, SettingsError, install
 

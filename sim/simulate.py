@@ -94,7 +94,7 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     if settings.draw:
         drawn = settings.with_car(draw_car(car_rng))
         return _as_recorded(simulate(track, drawn, seed), drawn)
-    faults = settings.faults
+    faults, sensor = settings.faults, settings.sensor
     track = to_map_frame(turned_round(track) if faults.vehicle.wrong_way else track)
     lap = track.centre_line.length
     driven = put_down(drive(track, settings.laps, settings.vehicle, wander_rng), lap, faults.vehicle)
@@ -111,14 +111,18 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
         calibration=calibration,
         sensor=errors if errors.any() else None,
         noise=_noise(settings),
-        bend=_bend(settings.sensor),
+        bend=np.array([sensor.range_bend, sensor.range_bend_from]) if sensor.range_bend else None,
     )
     log = Log(
         odometry=odometry,
         cycles=tuple(cycles),
         odometry_sigma=np.array(settings.odometry.white),
         odometry_drift=settings.odometry.drift(1.0 / settings.vehicle.rate),
-        sensor=_sensor_info(settings),
+        sensor=SensorInfo(
+            *(sensor.range_max, sensor.fov, sensor.rate),
+            kind="line" if settings.line.spacing else None,
+            sigma_range_scale=sensor.sigma_range_scale or None,
+        ),
         source=_source(track, settings, seed),
         truth=truth,
     )
@@ -156,32 +160,11 @@ def _noise(settings: SimulationSettings) -> Array | None:
     return np.array([*drift, sensor.slow_range, sensor.slow_bearing, sensor.slow_time])
 
 
-def _bend(sensor: SensorSettings) -> Array | None:
-    """Bend of the ranges (2,) in the order of `io.header:TRUE_ERRORS`, None where they don't bend."""
-    return np.array([sensor.range_bend, sensor.range_bend_from]) if sensor.range_bend else None
-
-
-def _sensor_info(settings: SimulationSettings) -> SensorInfo:
-    sensor = settings.sensor
-    return SensorInfo(
-        *(sensor.range_max, sensor.fov, sensor.rate),
-        kind="line" if settings.line.spacing else None,
-        sigma_range_scale=sensor.sigma_range_scale or None,
-    )
-
-
 def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
     """Track, seed, and each setting that isn't the default."""
     defaults = leaves(SimulationSettings())
     changed = {name: str(value) for name, value in leaves(settings).items() if value != defaults[name]}
     return {"track": track.name, "seed": str(seed), **changed}
-
-
-def _sensor(track: Track, settings: SimulationSettings, rng: Generator) -> ConeSensor | LineSensor:
-    labels = colours(track, settings.faults.vehicle.wrong_way)
-    if settings.line.spacing:
-        return LineSensor(track, labels, settings.sensor, settings.line, rng)
-    return ConeSensor(track.cones, labels, settings.sensor, rng)
 
 
 def _perceive(
@@ -197,7 +180,12 @@ def _perceive(
     A lap is `lap` m long.
     """
     faults, rate = settings.faults.sensor, settings.sensor.rate
-    sensor = _sensor(track, settings, sensor_rng)
+    labels = colours(track, settings.faults.vehicle.wrong_way)
+    sensor = (
+        LineSensor(track, labels, settings.sensor, settings.line, sensor_rng)
+        if settings.line.spacing
+        else ConeSensor(track.cones, labels, settings.sensor, sensor_rng)
+    )
     stamps = np.arange(int(driven.t[-1] * rate) + 1) / rate
     stamps = stamps[stamps - faults.latency <= driven.t[-1]]
     poses = _poses_at(driven, np.maximum(stamps - faults.latency, 0.0))

@@ -1,8 +1,7 @@
 """Track files of other simulators and of surveys: PacSim and fssim YAML, EUFS and TUM CSV."""
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -14,7 +13,8 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io import parsing as limits
-from pathspace_graph.io.parsing import Table, is_number, parse_yaml, read_table, read_text, shown, typed
+from pathspace_graph.io.parsing import Table, is_number, parse_yaml, read_text, shown, typed
+from pathspace_graph.io.tables import read_table
 from pathspace_graph.labels import BIG_ORANGE, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
@@ -38,34 +38,38 @@ EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
 EUFS_TAGS: Final = ("blue", "yellow", *EUFS_OTHER, "car_start", "midpoint")
 EUFS_COLUMNS: Final = ("tag", "x", "y", "direction", "x_variance", "y_variance", "xy_covariance")
 """Columns of an EUFS file in their order, which FSDS writes without a header."""
-
-
-@dataclass(frozen=True)
-class TrackFormat:
-    """A kind of track file: how it is recognized, and what reads it."""
-
-    description: str  # name of the format in messages
-    suffixes: tuple[str, ...]  # ends of file names (lower case, with the dot)
-    parse: Callable[[Path], Any]  # from a file to its content, or an InputError
-    recognizes: Callable[[Any], bool]
-    read: Callable[[Path, Any], Track]  # from the path, for errors, and the content
+KNOWN: Final = (
+    "expected a track file of a known kind: PacSim YAML (track: left, right, start), "
+    "fssim YAML (cones_left, cones_right, starting_pose_front_wing), "
+    "EUFS and FSDS CSV (tag,x,y,direction), TUM CSV (# x_m,y_m,w_tr_right_m,w_tr_left_m)"
+)
 
 
 def read_track(path: Path | str) -> Track:
     """Read the track in a file, its cones in driving order; an InputError names the row or key."""
-    path = Path(path)
+    path, track = Path(path), None
     if not path.is_file():
         raise InputError(path, f"expected a track file, found {'a folder' if path.is_dir() else 'none'}")
-    for known in FORMATS:
-        if path.suffix.lower() in known.suffixes and known.recognizes(content := known.parse(path)):
-            track = known.read(path, content)
-            _check(path, track)
-            return track
-    kinds = ", ".join(known.description for known in FORMATS)
-    expected = f"expected a track file of a known kind: {kinds}"
-    if path.suffix.lower() == ".csv":
-        raise InputError(path, f"{expected}, found {shown(_first_row(path))}", 1)
-    raise InputError(path, expected)
+    if path.suffix.lower() in (".yaml", ".yml"):
+        content = parse_yaml(read_text(path, "YAML", limits.MAX_TRACK_BYTES), path)
+        if isinstance(content, dict) and isinstance(content.get("track"), dict):
+            track = _pacsim(path, content["track"])
+        elif isinstance(content, dict) and not {"cones_left", "cones_right"}.isdisjoint(content):
+            track = _fssim(path, content)
+    elif path.suffix.lower() == ".csv":
+        text = read_text(path, most=limits.MAX_TRACK_BYTES)
+        first = next(filter(str.strip, text.split("\n")), "").strip()
+        table = read_table(path, comment="#", header=_missing_header(first))
+        if not {"x_m", "y_m"}.isdisjoint(table.columns):
+            track = _tum(table)
+        elif "tag" in table.columns:
+            track = _eufs(table)
+        else:
+            raise InputError(path, f"{KNOWN}, found {shown(first)}", 1)
+    if track is None:
+        raise InputError(path, KNOWN)
+    _check(path, track)
+    return track
 
 
 def _check(path: Path, track: Track) -> None:
@@ -97,20 +101,7 @@ def _check_size(path: Path, row: Array, name: str) -> None:
         raise InputError(path, f"{expected}, found {len(row)} over {length:g} m")
 
 
-# YAML: PacSim and fssim
-
-
-def _parse_yaml(path: Path) -> Any:
-    return parse_yaml(read_text(path, "YAML", limits.MAX_TRACK_BYTES), path)
-
-
-def _is_pacsim(data: Any) -> bool:
-    return isinstance(data, dict) and isinstance(data.get("track"), dict)
-
-
-def _is_fssim(data: Any) -> bool:
-    return isinstance(data, dict) and not {"cones_left", "cones_right"}.isdisjoint(data)
-
+# --- YAML: PacSim and fssim --------------------------------------------------------------------------------
 
 Number = Annotated[float, Meta(ge=-limits.MAX_COORDINATE, le=limits.MAX_COORDINATE)]
 Point = Annotated[list[Number], Meta(min_length=2)]
@@ -119,7 +110,7 @@ Angles = Annotated[list[Number], Meta(min_length=3)]  # also a place with a head
 
 class _Cone(Struct):
     position: Point
-    kind: Any = field(name="class", default="")
+    kind: str | float | bool | None = field(name="class", default="")
 
 
 Cones = Annotated[list[_Cone], Meta(max_length=limits.MAX_CONES)] | None
@@ -147,38 +138,27 @@ class _Fssim(Struct):
     cones_orange_big: Points = None
 
 
-def _pacsim(path: Path, content: Mapping[str, Any]) -> Track:
-    data = typed(content["track"], _Pacsim, path, "track", strict=False)
-    rows = [_pacsim_cones(cones) for cones in (data.left, data.right)]
-    others = [_pacsim_cones(data.unknown), *rows]
-    other, kinds = (np.concatenate(parts) for parts in zip(*others, strict=True))
-    big, orange = (np.char.find(kinds, word) >= 0 for word in ("big", ORANGE))
-    labels = np.where(orange, np.where(big, BIG_ORANGE, SMALL_ORANGE), UNKNOWN)
-    no_boundary = orange | (np.arange(len(labels)) < len(others[0][0]))
-    left, right = (
-        _without_repeats(points[np.char.find(kinds, ORANGE) < 0], data.closed) for points, kinds in rows
-    )
+def _pacsim(path: Path, content: Any) -> Track:
+    data = typed(content, _Pacsim, path, "track", strict=False)
+    lists = [cones or [] for cones in (data.unknown, data.left, data.right)]
+    points = _points([cone.position for cones in lists for cone in cones])
+    kinds = np.array([str(cone.kind) for cones in lists for cone in cones], str)
+    row = np.repeat(np.arange(3), [*map(len, lists)])  # of which list: of no boundary, left or right
+    orange, hidden = np.char.find(kinds, ORANGE) >= 0, (kinds == INVISIBLE) & (row > 0)
+    labels = np.where(np.char.find(kinds, "big") >= 0, BIG_ORANGE, SMALL_ORANGE)
+    labels = np.where(orange, labels, UNKNOWN)
+    left, right = (_without_repeats(points[(row == k) & ~orange], data.closed) for k in (1, 2))
     start = np.array([*data.start.position[:2], data.start.orientation[2]])
-    track = Track(left, right, other[no_boundary], data.closed, start, path.stem, labels[no_boundary])
-    hidden = np.vstack([points[kinds == INVISIBLE] for points, kinds in rows])
-    return _with_hidden(track, hidden) if len(hidden) else track
-
-
-def _with_hidden(track: Track, hidden: Array) -> Track:
-    left, right = (
-        row[~(row[:, None] == hidden).all(axis=2).any(axis=1)] for row in (track.left, track.right)
-    )
+    no_boundary = orange | (row == 0)
+    track = Track(left, right, points[no_boundary], data.closed, start, path.stem, labels[no_boundary])
+    if not hidden.any():
+        return track
+    seen = (cones[~(cones[:, None] == points[hidden]).all(axis=2).any(axis=1)] for cones in (left, right))
     s = np.arange(0.0, track.centre_line.length, WIDTH_STEP)
-    return replace(track, left=left, right=right, path=track.centre_line.points(s))
+    return replace(track, **dict(zip(("left", "right"), seen, strict=True)), path=track.centre_line.points(s))
 
 
-def _pacsim_cones(cones: Cones) -> tuple[Array, NDArray[np.str_]]:
-    """Points (n, 2) and the classes (n,) of a list of cones."""
-    points = _points([cone.position for cone in cones or ()])
-    return points, np.array([str(cone.kind) for cone in cones or ()], str)
-
-
-def _fssim(path: Path, content: Mapping[str, Any]) -> Track:
+def _fssim(path: Path, content: Any) -> Track:
     data = typed(content, _Fssim, path, strict=False)
     left, right = (_without_repeats(_points(row), closed=True) for row in (data.cones_left, data.cones_right))
     small, big = _points(data.cones_orange), _points(data.cones_orange_big)
@@ -192,6 +172,7 @@ def _points(rows: Points) -> Array:
 
 
 def _without_repeats(row: Array, closed: bool) -> Array:
+    """Drop each cone of a row (n, 2) at the place of the one before, also around a closed track."""
     if not len(row):
         return row
     row = row[np.append(True, np.linalg.norm(np.diff(row, axis=0), axis=1) > REPEAT_DISTANCE)]
@@ -200,46 +181,29 @@ def _without_repeats(row: Array, closed: bool) -> Array:
     return row
 
 
-# CSV: EUFS and TUM
+# --- CSV: EUFS and TUM -------------------------------------------------------------------------------------
 
 
-def _parse_csv(path: Path) -> Table:
-    return read_table(path, (), "#", limits.MAX_TRACK_BYTES, header=_missing_header(path))
-
-
-def _first_row(path: Path) -> str:
-    return next(filter(str.strip, read_text(path, most=limits.MAX_TRACK_BYTES).split("\n")), "").strip()
-
-
-def _missing_header(path: Path) -> tuple[str, ...]:
+def _missing_header(first: str) -> tuple[str, ...]:
     """Columns of a file of cones without a header: its first row is a cone; none of any other file."""
-    tag, *numbers = (part.strip(' "') for part in _first_row(path).split(","))
+    tag, *numbers = (part.strip(' "') for part in first.split(","))
     is_cone = tag.lower() in EUFS_TAGS and len(numbers) >= 2 and all(map(is_number, numbers[:2]))
     return EUFS_COLUMNS[: 1 + len(numbers)] if is_cone else ()
 
 
-def _is_tum(table: Table) -> bool:
-    return not {"x_m", "y_m"}.isdisjoint(table.columns)
-
-
-def _is_eufs(table: Table) -> bool:
-    return "tag" in table.columns and not _is_tum(table)
-
-
-def _eufs(path: Path, _: Table) -> Track:
-    table = read_table(path, ("tag", "x", "y"), header=_missing_header(path))
+def _eufs(table: Table) -> Track:
+    path, points = table.file, table.stack(("x", "y"))
     tags = np.array([tag.strip().lower() for tag in table.columns["tag"]])
-    points = table.stack(("x", "y"))
     if len(points) > 2 * limits.MAX_CONES:
         raise InputError(path, f"expected at most {2 * limits.MAX_CONES} cones, found {len(points)}")
-    left, right = (_without_duplicates(points[tags == tag]) for tag in ("blue", "yellow"))
-    others = [_without_duplicates(points[tags == tag]) for tag in EUFS_OTHER]
-    gate = points[tags == "big_orange"]
+    left, right, *others = (
+        _without_duplicates(points[tags == tag]) for tag in ("blue", "yellow", *EUFS_OTHER)
+    )
     for tag, cones in (("blue", left), ("yellow", right)):
         if len(cones) < MIN_CONES:
             raise InputError(path, f"expected at least {MIN_CONES} {tag} cones, found {len(cones)}")
     start = _eufs_start(table, tags, points, left, right)
-    order = driving_order(left, right, gate, start)
+    order = driving_order(left, right, points[tags == "big_orange"], start)
     count, placed = len(left) + len(right), 0 if order is None else len(order.left) + len(order.right)
     if order is None or placed < (1 - MAX_UNPLACED) * count:
         found = f"found {count - placed} of {count} cones off it"
@@ -253,17 +217,13 @@ def _eufs(path: Path, _: Table) -> Track:
 
 def _eufs_start(table: Table, tags: NDArray[np.str_], points: Array, left: Array, right: Array) -> Array:
     """Pose of the first `car_start`, or one between the first blue cone and its opposite."""
-    rows = np.flatnonzero(tags == "car_start")
+    rows = np.flatnonzero(tags == "car_start")[:1]
     if len(rows):
-        text = table.columns.get("direction", [""] * len(table))[rows[0]].strip()
-        try:
-            theta = float(text or 0.0)
-        except ValueError:
-            theta = math.nan
-        if not math.isfinite(theta):
+        text = table.columns["direction"][rows[0]].strip() if "direction" in table.columns else ""
+        if text and not (is_number(text) and math.isfinite(float(text))):
             expected = "expected the heading of car_start in column 'direction'"
-            table.fail(int(rows[0]), f"{expected}, found '{text}'")
-        return np.append(points[rows[0]], theta)
+            raise InputError(table.file, f"{expected}, found '{text}'", int(table.rows[rows[0]]))
+        return np.append(points[rows[0]], float(text or 0.0))
     opposite = right[np.argmin(np.linalg.norm(right - left[0], axis=1))]
     across = left[0] - opposite
     return np.append((left[0] + opposite) / 2, math.atan2(-across[0], across[1]))
@@ -279,8 +239,8 @@ def _without_duplicates(cones: Array) -> Array:
     return kept[:count]
 
 
-def _tum(path: Path, _: Table) -> Track:
-    circuit = _tum_circuit(path)
+def _tum(table: Table) -> Track:
+    circuit = _tum_circuit(table)
     knots = arc_lengths(circuit[:, :2])
     spline = scipy.interpolate.CubicSpline(knots, circuit[:, :2], bc_type="periodic")
     s = np.linspace(0.0, knots[-1], math.ceil(knots[-1] / WIDTH_STEP), endpoint=False)
@@ -291,34 +251,20 @@ def _tum(path: Path, _: Table) -> Track:
     )
     right, left = (resample(edge, CONE_SPACING, closed=True)[0] for edge in edges)
     start = np.append(circuit[0, :2], math.atan2(tangents[0, 1], tangents[0, 0]))
-    return Track(left, right, np.zeros((0, 2)), True, start, path.stem)
+    return Track(left, right, np.zeros((0, 2)), True, start, table.file.stem)
 
 
-def _tum_circuit(path: Path) -> Array:
+def _tum_circuit(table: Table) -> Array:
     """Checked rows [x, y, right width, left width], with the first repeated at the end (n + 1, 4)."""
-    table = read_table(path, TUM_COLUMNS, comment="#")
     circuit = table.stack(TUM_COLUMNS)
     widths = circuit[:, 2:]
     table.require(np.asarray(widths.min(axis=1) > 0), "expected widths above 0")
     widest = f"expected widths of at most {limits.MAX_TRACK_WIDTH:g} m"
     table.require(np.asarray(widths.max(axis=1) <= limits.MAX_TRACK_WIDTH), widest)
-    _check_size(path, circuit[:, :2], "the middle of the track")
+    _check_size(table.file, circuit[:, :2], "the middle of the track")
     moved = np.asarray(np.diff(arc_lengths(circuit[:, :2])) > REPEAT_DISTANCE)
     table.require(np.append(True, moved)[: len(circuit)], "expected a point other than the one before")
-    if len(circuit) > 1 and np.linalg.norm(circuit[-1, :2] - circuit[0, :2]) <= REPEAT_DISTANCE:
-        circuit = circuit[:-1]
+    circuit = circuit[: len(_without_repeats(circuit[:, :2], closed=True))]
     if len(circuit) < MIN_CONES:
-        raise InputError(path, f"expected at least {MIN_CONES} points, found {len(circuit)}")
+        raise InputError(table.file, f"expected at least {MIN_CONES} points, found {len(circuit)}")
     return ring(circuit)
-
-
-YAML: Final = (".yaml", ".yml")
-FORMATS: Final = (
-    TrackFormat("PacSim YAML (track: left, right, start)", YAML, _parse_yaml, _is_pacsim, _pacsim),
-    TrackFormat(
-        "fssim YAML (cones_left, cones_right, starting_pose_front_wing)", YAML, _parse_yaml, _is_fssim, _fssim
-    ),
-    TrackFormat("EUFS and FSDS CSV (tag,x,y,direction)", (".csv",), _parse_csv, _is_eufs, _eufs),
-    TrackFormat("TUM CSV (# x_m,y_m,w_tr_right_m,w_tr_left_m)", (".csv",), _parse_csv, _is_tum, _tum),
-)
-"""The first format that recognizes a file reads it; docs/estimators.md shows how a format is added."""

@@ -22,7 +22,7 @@ from pathspace_graph import FixedLagMapper, Log, Odometry
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.graph.window import WindowFactors
-from pathspace_graph.io.log import write_log
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.run import split_odometry

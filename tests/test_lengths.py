@@ -24,7 +24,8 @@ from pathspace_graph.estimators import BATCH, ONLINE, make_batch, make_online
 from pathspace_graph.eval.metrics.measures import measure
 from pathspace_graph.eval.metrics.summary import laps_of, summarize
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
-from pathspace_graph.io.log import Log, read_log, write_log
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.map import SplineBoundary, read_map
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.lengths import scaled

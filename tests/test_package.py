@@ -18,7 +18,8 @@ from threadpoolctl import threadpool_info
 
 import pathspace_graph
 from pathspace_graph.cli import COMMANDS, main
-from pathspace_graph.io.log import Detections, Log, Odometry, write_log
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import LEFT, RIGHT
 
 from .scenes.paths import ROOT
@@ -110,6 +111,12 @@ def test_help_waits_for_no_heavy_library(command: str) -> None:
     assert ("numpy" in loaded) == (command in ("simulate", "convert"))
 
 
+def test_an_estimator_does_not_wait_for_what_reads_files() -> None:
+    homes = ("online.fixed_lag", "batch.mapper", "loop.worker", "ros.node", "sim.simulate")
+    loaded = modules_after(f"import {', '.join(f'pathspace_graph.{home}' for home in homes)}")
+    assert not loaded & {"pandas", "pathspace_graph.io.tables"}
+
+
 def test_a_wrong_usage_waits_for_no_library_either() -> None:
     loaded = modules_after("from pathspace_graph.cli import main; main(['online', 'LOG', '--lag', 'x'])")
     assert not loaded & {"numpy", "gtsam", "rich", "docstring_parser"}
@@ -130,9 +137,11 @@ def test_a_package_that_is_not_built_says_what_to_do() -> None:
 
 def test_a_command_without_its_extra_says_how_to_install_it() -> None:
     run = "from pathspace_graph.cli import main; sys.exit(main(['compare', 'log', '--out', 'out']))"
-    code = f"import sys; sys.modules['pandas'] = None; {run}"
+    code = f"import sys; sys.modules['matplotlib'] = None; {run}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    said = "pathspace-graph: expected the package pandas (pip install 'pathspace-graph[eval]'), found none\n"
+    said = (
+        "pathspace-graph: expected the package matplotlib (pip install 'pathspace-graph[eval]'), found none\n"
+    )
     assert (done.returncode, done.stderr) == (2, said)
 
 

@@ -26,7 +26,7 @@ LATE = {
 ASKED = {"io.brief"}
 """Modules that import from above by name where a user asks a record for its picture or its frame."""
 
-LEAVES = {"errors", "labels", "console", "lengths", "copies"}
+LEAVES = {"errors", "labels", "console", "lengths", "copies", "provenance"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "baselines"}
 BELOW_MAPPING = {

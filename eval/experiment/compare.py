@@ -20,7 +20,8 @@ from pathspace_graph.eval.metrics.summary import has_cones, versions
 from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.overrides import Overrides
-from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory
+from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE
+from pathspace_graph.io.tables import read_trajectory
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .cells import EstimatorCell

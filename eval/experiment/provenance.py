@@ -3,11 +3,7 @@
 import ast
 import os
 import platform
-import re
-import shutil
-import subprocess
 import sys
-from datetime import UTC, datetime
 from functools import cache
 from hashlib import sha256
 from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec
@@ -16,11 +12,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from threadpoolctl import threadpool_info
-
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.metrics.summary import versions
+from pathspace_graph.provenance import commit_of, machine, now
 
 HOUSE: Final = __name__.partition(".")[0]
 MEASURED: Final = (  # modules on which every result depends, whatever the estimator is
@@ -144,36 +139,14 @@ def made(module: str) -> dict[str, Any]:
     """Return where and when a result of what is in a module is made, and with which libraries."""
     packages = {HOUSE, module.partition(".")[0]}
     commits = {name: commit for name in sorted(packages) if (commit := commit_of(_folder(name)))}
-    now = datetime.now(UTC).isoformat(timespec="seconds")
     return {
         **versions(),
         "commit": " ".join(commits.values() if len(packages) == 1 else map(" ".join, commits.items())),
-        **_machine(),
-        "date": now,
+        **machine(),
+        "date": now(),
     }
 
 
 def _folder(package: str) -> Path | None:
     spec = _spec(package)
     return None if spec is None or spec.origin is None else Path(spec.origin).parent
-
-
-@cache
-def _machine() -> dict[str, str]:
-    file, blas = Path("/proc/cpuinfo"), {pool.get("architecture") for pool in threadpool_info()}
-    model = re.search(r"model name\s*: (.*)", file.read_text()) if file.exists() else None
-    processor = model[1] if model else platform.processor() or platform.machine()
-    return {"host": platform.node(), "processor": processor, "blas": " ".join(sorted(filter(None, blas)))}
-
-
-@cache
-def commit_of(folder: Path | None) -> str:
-    """Return the short hash of the commit that is checked out, with `+` where something differs from it.
-
-    It is empty where there is none.
-    """
-    git = shutil.which("git")
-    if git is None or folder is None:
-        return ""
-    command = [git, "-C", str(folder), "describe", "--always", "--dirty=+", "--exclude=*"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()

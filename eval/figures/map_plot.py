@@ -17,7 +17,6 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary
-from pathspace_graph.io.moved import moved
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, POINTS, RIGHT, UNKNOWN
 
 from . import style
@@ -162,7 +161,7 @@ def plot_apart(first: Map, second: Map, apart: MapsApart, *, title: str | None =
     with style.figure_context():
         figure = Picture(layout="constrained")
         axes = figure.add_subplot()
-        for track, color, name in ((moved(first, apart.motion), BLUE, "first"), (second, DARK, "second")):
+        for track, color, name in ((first.moved(apart.motion), BLUE, "first"), (second, DARK, "second")):
             for boundary in track.boundaries.values():
                 points = mapped_points(boundary)
                 if isinstance(boundary, PointBoundary):

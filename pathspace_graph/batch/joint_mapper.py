@@ -11,7 +11,6 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, path_lengths
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import PointBoundary
-from pathspace_graph.io.moved import moved
 from pathspace_graph.lengths import scaled
 from pathspace_graph.run import Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
@@ -162,6 +161,6 @@ class _Joint:
         """Return the orange cones of the first drive that has some of a label, by label."""
         found = dict[int, PointBoundary]()
         for one in self.placed:
-            own = moved(scaled(one.alone.map, 1.0 / one.alone.scale), one.motion).points
+            own = scaled(one.alone.map, 1.0 / one.alone.scale).moved(one.motion).points
             found = {**own, **found}
         return found

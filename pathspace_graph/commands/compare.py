@@ -17,7 +17,7 @@ from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import save_plot
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.io.files import atomic_folder, check_target
-from pathspace_graph.io.log import write_log
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.results import write_result
 from pathspace_graph.options.map import Demo
 from pathspace_graph.options.study import Compare

@@ -19,7 +19,8 @@ from pathspace_graph.front_end.gate import check_usable
 from pathspace_graph.front_end.noise import measure
 from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.files import check_target
-from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE, Log, Odometry, write_log
+from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE, Log, Odometry
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.options.data import Convert

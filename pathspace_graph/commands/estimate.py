@@ -27,7 +27,6 @@ from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map
-from pathspace_graph.io.moved import moved_run
 from pathspace_graph.io.overrides import override
 from pathspace_graph.io.results import BatchRun, RunResult, write_result
 from pathspace_graph.io.ribbon import as_ribbon
@@ -205,7 +204,7 @@ def summary_of_drives(joint: JointResult, logs: Mapping[str, Log]) -> dict[str, 
     drives = dict[str, Any]()
     shown = ("lap_count", "noise", "calibration", "final", "ate", "inside_two_sigma")
     for name, result in joint.drives.items():
-        own = summarize(moved_run(result, inverse(joint.frames[name])), logs[name])
+        own = summarize(result.moved(inverse(joint.frames[name])), logs[name])
         drives[name] = {"frame": joint.frames[name], **{key: own[key] for key in shown if key in own}}
     return {"drives": drives, "left_out": joint.left_out}
 

@@ -10,16 +10,11 @@ from pathspace_graph.health import LOST
 from pathspace_graph.io import export as formats
 from pathspace_graph.io.export import LocalPlane
 from pathspace_graph.io.files import atomic_file, check_file_target
-from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE, read_log
+from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE
+from pathspace_graph.io.log_files import read_log
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
-from pathspace_graph.io.parsing import read_table
-from pathspace_graph.io.results import (
-    CYCLES_FILE,
-    SMOOTHED_FILE,
-    TRAJECTORY_FILE,
-    read_trajectory,
-    write_trajectory,
-)
+from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FILE, write_trajectory
+from pathspace_graph.io.tables import read_table, read_trajectory
 from pathspace_graph.options.map import Export
 from pathspace_graph.spline.ahead import LEAST_STEP, MOST_POINTS
 from pathspace_graph.spline.crossing import crossed_boundaries, crossings_told

@@ -7,10 +7,11 @@ from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import check_plot_file, save_plot
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.files import check_file_target
-from pathspace_graph.io.log import read_log
+from pathspace_graph.io.log_files import read_log
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.parsing import read_json
-from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FILE, read_trajectory
+from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FILE
+from pathspace_graph.io.tables import read_trajectory
 from pathspace_graph.options.map import Plot
 
 from .outcome import Outcome

@@ -5,7 +5,8 @@ import numpy as np
 from pathspace_graph.console import progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.files import check_target
-from pathspace_graph.io.log import LOG_FILE, Log, write_log
+from pathspace_graph.io.log import LOG_FILE, Log
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.options.data import Simulate
 from pathspace_graph.sim.simulate import simulate
 from pathspace_graph.sim.track import EVENTS, Track

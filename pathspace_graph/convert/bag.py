@@ -1,9 +1,9 @@
 """ROS bags, read without ROS: rosbag1, and rosbag2 as sqlite3 and mcap."""
 
+import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -61,25 +61,32 @@ class Motion(NamedTuple):
 
 def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool = False) -> Recording:
     """Read the drive in the topics of a bag; `mounted` says that the sensor's pose was stated."""
-    notes: Counter[str] = Counter()
+    notes, namespaces = Counter[str](), Counter[str]()
 
     def motion(message: Any) -> Motion:
         twist = twist_of(message, options.wheelbase)
         return Motion(twist, pose_of(message), frame_of(message), frame_of(message, "child_frame_id"))
 
-    namespaces = Counter[str]()
-
     def points(message: Any) -> tuple[str, Points]:
         namespaces.update(namespaces_of(message))
         return frame_of(message), points_of(message, rule, options.namespaces)
 
-    with opened(path, options, notes) as bag:
+    with closing(Bag(path, options, notes)) as bag:
         odometry = bag.samples(options.odometry, "--odometry", motion)
         imu = bag.samples(options.imu, "--imu", yaw_rate_of) if options.imu else None
         detections = bag.samples(options.detections, "--detections", points)
         static = [] if mounted else bag.transforms()
-    _check_namespaces(namespaces, options.namespaces, notes, path)
-    moved, are_poses = _motion(odometry, imu, options, path)
+    listed = ", ".join(f"'{name}' ({count} markers)" for name, count in sorted(namespaces.items()))
+    for name in options.namespaces:
+        if name not in namespaces:
+            expected = f"--namespaces: expected one of {listed or 'an array of markers'}"
+            raise InputError(path, f"{expected}, found '{name}'")
+    if len(namespaces) > 1 and not options.namespaces:
+        told = f"namespaces of markers were read together: {listed} (--namespaces chooses)"
+        notes[told] += len(namespaces)
+    if imu is not None:
+        check_clock(imu.t, "the IMU", path)
+    moved, are_poses = _motion(odometry, imu is not None, options, path)
     mounting = None if mounted else _mounting(odometry, detections, static, notes, path)
     source = {"bag": path.name, "odometry": odometry.name, "detections": detections.name}
     source |= {} if imu is None else {"imu": imu.name}
@@ -87,7 +94,7 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
         odometry.t,
         moved,
         detections.t,
-        [scan for _, scan in detections.values],
+        Points.joined([points for _, points in detections.values]),
         source,
         notes,
         mounting=mounting,
@@ -99,16 +106,23 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
     )
 
 
-def _check_namespaces(found: Counter[str], chosen: Sequence[str], notes: Counter[str], path: Path) -> None:
-    """Note the namespaces of markers where there are several; InputError if a chosen one isn't there."""
-    listed = ", ".join(f"'{name}' ({count} markers)" for name, count in sorted(found.items()))
-    for name in chosen:
-        if name not in found:
-            raise InputError(
-                path, f"--namespaces: expected one of {listed or 'an array of markers'}, found '{name}'"
-            )
-    if len(found) > 1 and not chosen:
-        notes[f"namespaces of markers were read together: {listed} (--namespaces chooses)"] += len(found)
+def _motion(odometry: Samples, has_imu: bool, options: BagOptions, path: Path) -> tuple[Array, bool]:
+    """Twists (N, 3) of the vehicle, with NaN for what an IMU gives, or its poses; and which of both."""
+    measured = [motion.twist for motion in odometry.values if motion.twist is not None]
+    poses = np.array([motion.pose for motion in odometry.values if motion.pose is not None])
+    whole = len(poses) == len(odometry.values)
+    if options.from_poses or not measured:
+        if not whole:
+            raise InputError(path, f"--from-poses: expected messages with a pose, found {odometry.name}")
+        return poses, True
+    twists = np.array(measured)
+    if whole and not twists.any() and np.ptp(poses, axis=0).any():
+        found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
+        raise InputError(path, f"{odometry.name}: expected twists, {found}")
+    if not has_imu and np.isnan(twists[:, 2]).all():
+        expected = "expected --imu TOPIC for the yaw rate, or --wheelbase where there is a steering angle"
+        raise InputError(path, f"{odometry.name}: {expected}, found neither")
+    return twists, False
 
 
 # --- where the sensor is ---------------------------------------------------------------------------------
@@ -160,63 +174,38 @@ def transform_between(static: list[Any], body: str, sensor: str) -> Array | None
     return known.get(sensor)
 
 
-# --- motion ----------------------------------------------------------------------------------------------
-
-
-def _motion(odometry: Samples, imu: Samples | None, options: BagOptions, path: Path) -> tuple[Array, bool]:
-    """Twists (N, 3) of the vehicle, with NaN for what an IMU gives, or its poses; and which of both."""
-    measured = [motion.twist for motion in odometry.values if motion.twist is not None]
-    poses = np.array([motion.pose for motion in odometry.values if motion.pose is not None])
-    whole = len(poses) == len(odometry.values)
-    if imu is not None:
-        check_clock(imu.t, "the IMU", path)
-    if options.from_poses or not measured:
-        if not whole:
-            raise InputError(path, f"--from-poses: expected messages with a pose, found {odometry.name}")
-        return poses, True
-    twists = np.array(measured)
-    if whole and not twists.any() and np.ptp(poses, axis=0).any():
-        found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
-        raise InputError(path, f"{odometry.name}: expected twists, {found}")
-    if imu is None and np.isnan(twists[:, 2]).all():
-        expected = "expected --imu TOPIC for the yaw rate, or --wheelbase where there is a steering angle"
-        raise InputError(path, f"{odometry.name}: {expected}, found neither")
-    return twists, False
-
-
 # --- bags ------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def opened(path: Path, options: BagOptions, notes: Counter[str]) -> "Iterator[Bag]":
-    if not path.exists():
-        raise InputError(path, "expected a bag, found none")
-    rosbag1, rosbag2, _ = _rosbags()
-    definitions = _given_definitions(options.definition)
-    try:
-        reader = (rosbag1 if is_ros1(path) else rosbag2).Reader(path)
-        reader.open()
-    except Exception as error:
-        raise InputError(path, f"expected a ROS bag, found {described(path)} ({error}); {READABLE}") from None
-    try:
-        yield Bag(path, reader, definitions, options.received, notes)
-    finally:
-        reader.close()
-
-
-@dataclass(frozen=True)
 class Bag:
     """A bag as the package `rosbags` reads it, with InputErrors in place of its errors."""
 
-    path: Path
-    reader: Any
-    definitions: dict[str, Any]  # definitions of messages from the options
-    received: bool  # take the times of receipt as stamps
-    notes: Counter[str]
+    def __init__(self, path: Path, options: BagOptions, notes: Counter[str]) -> None:
+        if not path.exists():
+            raise InputError(path, "expected a bag, found none")
+        try:
+            from rosbags import rosbag1, rosbag2, typesys  # noqa: PLC0415
+        except ImportError:
+            raise PathspaceError(
+                f"bags: expected the package rosbags, found none: {install('ros')}"
+            ) from None
+        self._path, self._received, self._notes, self._types = path, options.received, notes, typesys
+        # a folder is a bag of rosbag2, whatever its name
+        self._is_ros1 = path.name.endswith((".bag", ".bag.active")) and not path.is_dir()
+        self._definitions = self._given(options.definition)
+        try:
+            self._reader = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
+            self._reader.open()
+        except Exception as error:
+            found = f"found {described(path)} ({error}); {READABLE}"
+            raise InputError(path, f"expected a ROS bag, {found}") from None
+
+    def close(self) -> None:
+        self._reader.close()
 
     def samples(self, topic: str | None, option: str, take: Callable[[Any], Any]) -> Samples:
         """`take` the messages of a topic, with their header stamps if most have one, else of receipt."""
-        connections = self._connections(topic)
+        connections = [entry for entry in self._reader.connections if entry.topic == topic]
         if not connections:
             found = "found none" if topic is None else f"found {topic}"
             raise self._error(f"{option}: expected a topic of the bag, {found}")
@@ -224,130 +213,100 @@ class Bag:
         received, stamps, values = self._read(connections, take, option)
         if not values:
             raise self._error(f"{option}: expected messages of {topic}, found none")
-        stamped = [] if self.received else [k for k, stamp in enumerate(stamps) if stamp is not None]
+        stamped = [] if self._received else [k for k, stamp in enumerate(stamps) if stamp is not None]
         if 2 * len(stamped) <= len(stamps):
-            self.notes[f"messages of {topic} have the time at which they were received"] += len(values)
+            self._notes[f"messages of {topic} have the time at which they were received"] += len(values)
             return Samples(name, np.array(received), values, np.arange(len(values)) + 1)
-        self.notes[f"messages of {topic} without a stamp were left out"] += len(stamps) - len(stamped)
+        self._notes[f"messages of {topic} without a stamp were left out"] += len(stamps) - len(stamped)
         t = np.array([stamps[k] for k in stamped], dtype=float)
         late = float(np.median(np.array(received)[stamped] - t))
         if abs(late) > LATE:
             told = f"messages of {topic} were received {late:.3g} s after their stamps, in the median"
-            self.notes[f"{told} (--received takes the times of receipt)"] += len(stamped)
+            self._notes[f"{told} (--received takes the times of receipt)"] += len(stamped)
         return Samples(name, t, [values[k] for k in stamped], np.array(stamped) + 1)
 
     def transforms(self) -> list[Any]:
         """`TransformStamped`s between frames fixed to the vehicle, of which there may be none."""
-        connections = self._connections(STATIC)
-        if not connections:
-            return []
-        _, _, messages = self._read(connections, lambda message: list(message.transforms), "transforms")
-        return [one for message in messages for one in message]
-
-    def _connections(self, topic: str | None) -> list[Any]:
-        return [entry for entry in self.reader.connections if entry.topic == topic]
+        connections = [entry for entry in self._reader.connections if entry.topic == STATIC]
+        read = self._read(connections, lambda message: list(message.transforms), "transforms")
+        return [one for message in read[2] for one in message]
 
     def _error(self, message: str) -> InputError:
-        seconds = 1e-9 * (self.reader.end_time - self.reader.start_time)
+        seconds = 1e-9 * (self._reader.end_time - self._reader.start_time)
         topics = [
             f"{name} ({topic.msgtype}, {topic.msgcount} messages, {rate(topic.msgcount, seconds)})"
-            for name, topic in sorted(self.reader.topics.items())
+            for name, topic in sorted(self._reader.topics.items())
             if topic.msgcount
         ]
         listed = f"the topics with messages are {', '.join(topics)}"
-        return InputError(self.path, f"{message}; {listed if topics else 'it has no messages at all'}")
+        return InputError(self._path, f"{message}; {listed if topics else 'it has no messages at all'}")
 
     def _read(
         self, connections: list[Any], take: Callable[[Any], Any], option: str
     ) -> tuple[list[float], list[float | None], list[Any]]:
         """Read the times of receipt, the stamps and what was taken of all messages of a topic."""
-        store, kind = self._store(connections[0]), connections[0].msgtype
-        decode = store.deserialize_ros1 if is_ros1(self.path) else store.deserialize_cdr
         received, stamps, values = list[float](), list[float | None](), list[Any]()
-        try:
-            for time, data in self._messages(connections):
+        if not connections:
+            return received, stamps, values
+        store, kind = self._store(connections[0]), connections[0].msgtype
+        decode = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
+        messages = self._reader.messages(connections)
+        while True:
+            try:
+                _, time, data = next(messages)
+            except StopIteration:
+                return received, stamps, values
+            except Exception as error:
+                damaged = f"expected a whole bag, found one that is damaged ({error})"
+                raise InputError(self._path, damaged) from None
+            try:
                 message = decode(data, kind)
                 values.append(take(message))
                 stamps.append(stamp_of(message))
-                received.append(1e-9 * time)
-        except InputError:
-            raise
-        except MessageError as error:
-            where = f"{option} {connections[0].topic} ({kind})"
-            raise self._error(f"{where}: {error}; supported are messages with {SUPPORTED[option]}") from None
-        except Exception as error:
-            where = f"message {len(values) + 1} of {connections[0].topic} ({kind})"
-            raise InputError(self.path, f"{where}: expected one that can be read ({error})") from None
-        return received, stamps, values
-
-    def _messages(self, connections: list[Any]) -> Iterator[tuple[int, bytes]]:
-        """Yield the time of receipt (ns) and the bytes of each message; a damaged bag is an InputError."""
-        try:
-            for _, time, data in self.reader.messages(connections):
-                yield time, data
-        except Exception as error:
-            raise InputError(
-                self.path, f"expected a whole bag, found one that is damaged ({error})"
-            ) from None
+            except MessageError as error:
+                told = f"{option} {connections[0].topic} ({kind}): {error}"
+                raise self._error(f"{told}; supported are messages with {SUPPORTED[option]}") from None
+            except Exception as error:
+                where = f"message {len(received) + 1} of {connections[0].topic} ({kind})"
+                raise InputError(self._path, f"{where}: expected one that can be read ({error})") from None
+            received.append(1e-9 * time)
 
     def _store(self, connection: Any) -> Any:
         """Types of a topic: those of the bag, else those of the options and of ROS."""
-        *_, typesys = _rosbags()
-        ros = typesys.Stores.ROS1_NOETIC if is_ros1(self.path) else typesys.Stores.ROS2_HUMBLE
+        stores, text, known = self._types.Stores, connection.msgdef.data, dict[str, Any]()
         try:
-            known = _types_of(connection, typesys)
-            known = known or {**typesys.get_typestore(ros).fielddefs, **self.definitions}
-            store = typesys.get_typestore(typesys.Stores.EMPTY)
+            if connection.msgdef.format.name == "MSG":
+                known |= self._types.get_types_from_msg(text, connection.msgtype)
+            elif connection.msgdef.format.name == "IDL":
+                parts = (re.sub(r"\AIDL: .*\n", "", part) for part in text.split("=" * 80 + "\n"))
+                for part in filter(str.strip, parts):
+                    known |= self._types.get_types_from_idl(part)
+            else:  # an old bag defines none
+                ros = self._types.get_typestore(stores.ROS1_NOETIC if self._is_ros1 else stores.ROS2_HUMBLE)
+                known |= {**ros.fielddefs, **self._definitions}
+            store = self._types.get_typestore(stores.EMPTY)
             store.register(known)
             store.get_msgdef(connection.msgtype)
         except Exception as error:
             found = f"found a type without a definition ({connection.msgtype}: {error})"
             expected = f"{connection.topic}: expected a known type"
-            raise InputError(self.path, f"{expected}, {found}; --definition provides one") from None
+            raise InputError(self._path, f"{expected}, {found}; --definition provides one") from None
         return store
 
-
-def is_ros1(path: Path) -> bool:
-    """Whether a bag is one of rosbag1: a file. A folder is a bag of rosbag2, whatever its name."""
-    return path.name.endswith((".bag", ".bag.active")) and not path.is_dir()
-
-
-def _types_of(connection: Any, typesys: Any) -> dict[str, Any]:
-    """Types that the bag defines for a topic; an old bag defines none."""
-    text, form = connection.msgdef.data, connection.msgdef.format.name
-    if form == "MSG":
-        return dict(typesys.get_types_from_msg(text, connection.msgtype))
-    if form != "IDL":
-        return {}
-    types: dict[str, Any] = {}
-    for part in filter(str.strip, text.split("=" * 80 + "\n")):
-        head, _, body = part.partition("\n")
-        types |= typesys.get_types_from_idl(body if head.startswith("IDL: ") else part)
-    return types
-
-
-def _given_definitions(definitions: Sequence[str]) -> dict[str, Any]:
-    *_, typesys = _rosbags()
-    types: dict[str, Any] = {}
-    for entry in definitions:
-        stated, equals, path = entry.rpartition("=")
-        file = Path(path)
-        parts = stated.split("/") if equals else [*file.absolute().parts[-3:-1], file.stem]
-        parts = [part for part in parts if part != "msg"]
-        if len(parts) < 2 or not all(parts):
-            raise SettingsError(f"--definition: expected PACKAGE/msg/NAME=FILE, found '{entry}'")
-        name = f"{parts[-2]}/msg/{parts[-1]}"
-        text = read_text(file, "a message definition")
-        try:
-            types |= typesys.get_types_from_msg(text, name)
-        except Exception as error:
-            raise InputError(file, f"expected the definition of {name} ({error})") from None
-    return types
-
-
-def _rosbags() -> tuple[Any, Any, Any]:
-    try:
-        from rosbags import rosbag1, rosbag2, typesys  # noqa: PLC0415
-    except ImportError:
-        raise PathspaceError(f"bags: expected the package rosbags, found none: {install('ros')}") from None
-    return rosbag1, rosbag2, typesys
+    def _given(self, definitions: Sequence[str]) -> dict[str, Any]:
+        """Types of messages that the options define, as PACKAGE/msg/NAME=FILE or by the end of a path."""
+        types: dict[str, Any] = {}
+        for entry in definitions:
+            stated, equals, path = entry.rpartition("=")
+            file = Path(path)
+            parts = stated.split("/") if equals else [*file.absolute().parts[-3:-1], file.stem]
+            parts = [part for part in parts if part != "msg"]
+            if len(parts) < 2 or not all(parts):
+                raise SettingsError(f"--definition: expected PACKAGE/msg/NAME=FILE, found '{entry}'")
+            name = f"{parts[-2]}/msg/{parts[-1]}"
+            text = read_text(file, "a message definition")
+            try:
+                types |= self._types.get_types_from_msg(text, name)
+            except Exception as error:
+                raise InputError(file, f"expected the definition of {name} ({error})") from None
+        return types

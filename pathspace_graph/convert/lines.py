@@ -1,7 +1,6 @@
 """Points of lines, kerbs or walls: evenly spaced, and labelled by their side of the driven path."""
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -23,65 +22,54 @@ WALL_FARTHEST: Final = 3.0  # distance of a boundary point from the path, in dis
 NEXT_LINE: Final = 1.5  # distance of a polyline from the path, in distances of the nearest one on its side
 
 
-def are_lines(scans: list[Points], spacing: float | None) -> bool:
+def are_lines(points: Points, spacing: float | None) -> bool:
     """Whether a record has points of lines: a spacing is stated, or no point stands alone."""
-    lines = np.concatenate([np.zeros(0, int), *(scan.lines for scan in scans)])
-    return spacing is not None or bool(len(lines) and (lines != ALONE).all())
+    return spacing is not None or bool(len(points.lines) and (points.lines != ALONE).all())
 
 
-def default_spacing(scans: list[Points]) -> float:
+def default_spacing(points: Points) -> float:
     """Spacing (m) of a record that states none."""
-    points = np.concatenate([np.zeros((0, 2)), *(scan.points for scan in scans)])
-    return max(SPACING_SHARE * float(np.median(np.hypot(*points.T))), LEAST_SPACING)
+    return max(SPACING_SHARE * float(np.median(np.hypot(*points.points.T))), LEAST_SPACING)
 
 
 def lines_of(
     t: Array,
-    scans: list[Points],
+    points: Points,
     odometry: Odometry,
     frames: Frames,
     spacing: float | None,
     notes: Counter[str],
-) -> list[Points]:
-    """Space the points of scans at the stamps t (n,) in s evenly (m), and label them by the driven path.
+) -> Points:
+    """Space the points of messages at the stamps t (n,) in s evenly (m), and label them by the driven path.
 
     A label that a point has stays. Points farther from the path than a boundary are dropped.
     """
-    spacing = spacing or default_spacing(scans)
-    found = [along_lines(scan, spacing) for scan in scans]
-    told = f"points of lines are {spacing:.2g} m apart (--spacing), of {count(scans)} that were recorded"
-    notes[told] += count(found)
-    path = DrivenPath.of(odometry, 0.5 * spacing)
-    places = [in_vehicle(scan.points, frames) for scan in found]
-    lateral = [path.lateral(float(at), points) for at, points in zip(t, places, strict=True)]
-    kept = [nearest_lines(scan.lines, away) for scan, away in zip(found, lateral, strict=True)]
-    limit = farthest(np.concatenate(lateral))
-    result = []
-    for scan, away, near in zip(found, lateral, kept, strict=True):
-        labels = np.select(
-            [scan.labels != UNKNOWN, away > 0.0, away < 0.0], [scan.labels, LEFT, RIGHT], UNKNOWN
-        )
-        result.append(scan._replace(labels=labels).where(near & ~(np.abs(away) > limit)))
-    notes["points of lines were too far from the driven path, and were left out"] += count(found) - count(
-        result
+    spacing = spacing or default_spacing(points)
+    scans = [along_lines(scan, spacing) for scan in points.apart(len(t))]
+    found = Points.joined(scans)
+    told = (
+        f"points of lines are {spacing:.2g} m apart (--spacing), of {len(points.labels)} that were recorded"
     )
-    return result
-
-
-def count(scans: Iterable[Points]) -> int:
-    return sum(len(scan.labels) for scan in scans)
+    notes[told] += len(found.labels)
+    path = DrivenPath.of(odometry, 0.5 * spacing)
+    places = [in_vehicle(scan.points, frames) for scan in scans]
+    lateral = [path.lateral(float(at), own) for at, own in zip(t, places, strict=True)]
+    kept = np.concatenate([nearest_lines(scan.lines, own) for scan, own in zip(scans, lateral, strict=True)])
+    away = np.concatenate(lateral)
+    known = np.abs(away[np.isfinite(away)])
+    if len(known):
+        kept &= ~(np.abs(away) > WALL_FARTHEST * np.median(known))
+    labels = np.select(
+        [found.labels != UNKNOWN, away > 0.0, away < 0.0], [found.labels, LEFT, RIGHT], UNKNOWN
+    )
+    notes["points of lines were too far from the driven path, and were left out"] += int((~kept).sum())
+    return found._replace(labels=labels).where(kept)
 
 
 def in_vehicle(points: Array, frames: Frames) -> Array:
     """Transform points (m, 2) of the sensor to the vehicle frame."""
     x, y, yaw = frames.mounting or (0.0, 0.0, 0.0)
     return np.asarray((points * frames.sides) @ rotation(yaw).T + np.array([x, y]))
-
-
-def farthest(lateral: Array) -> float:
-    """Largest distance (m) of a boundary from the path, by all lateral distances (m,)."""
-    known = np.abs(lateral[np.isfinite(lateral)])
-    return WALL_FARTHEST * float(np.median(known)) if len(known) else np.inf
 
 
 def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
@@ -104,7 +92,7 @@ def along_lines(points: Points, spacing: float) -> Points:
         placed = resampled(own.points, spacing)
         labels = np.full(len(placed), own.labels[0])
         parts.append(Points.of(placed, labels, lines=np.full(len(placed), line)))
-    return Points(*map(np.concatenate, zip(*parts, strict=True)))
+    return Points.joined(parts)
 
 
 def resampled(vertices: Array, spacing: float) -> Array:

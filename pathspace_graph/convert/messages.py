@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import fields, is_dataclass
+from itertools import pairwise
 from numbers import Real
 from typing import Any, Final, NamedTuple
 
@@ -48,12 +49,13 @@ def first_of(holder: Any, names: Iterable[str]) -> Any:
 
 
 class Points(NamedTuple):
-    """Detected points of one message, in the frame of its sensor."""
+    """Detected points of a message or of several, in the frame of their sensor."""
 
     points: Array  # (m, 2) points in m
     covariances: Array  # (m, 2, 2) covariances in m^2, NaN where the message does not give them
     labels: IntArray  # (m,) labels
     lines: IntArray  # (m,) number of the polyline of each, in the order of its vertices; or ALONE, or DENSE
+    message: IntArray  # (m,) number of the message of each, in order
 
     @classmethod
     def of(cls, points: Any, labels: Any, covariances: Any = None, lines: Any = ALONE) -> "Points":
@@ -62,11 +64,23 @@ class Points(NamedTuple):
         covariances = np.full((len(placed), 2, 2), np.nan) if covariances is None else covariances
         covariances = np.array(covariances, float).reshape(-1, 2, 2)
         lines = np.array(np.broadcast_to(lines, len(placed)), dtype=int)
-        return cls(placed, covariances, np.array(labels, dtype=int), lines)
+        return cls(placed, covariances, np.array(labels, dtype=int), lines, np.zeros(len(placed), int))
+
+    @classmethod
+    def joined(cls, messages: Sequence["Points"]) -> "Points":
+        """Join the points of messages, which get their numbers."""
+        numbers = np.repeat(np.arange(len(messages)), [len(one.labels) for one in messages])
+        columns = zip(cls.of([], []), *messages, strict=True)
+        return cls(*map(np.concatenate, columns))._replace(message=numbers)
+
+    def apart(self, count: int) -> list["Points"]:
+        """Points of each of so many messages."""
+        ends = np.searchsorted(self.message, np.arange(count + 1))
+        return [self.where(slice(*span)) for span in pairwise(ends.tolist())]
 
     def where(self, chosen: BoolArray | IntArray | slice) -> "Points":
-        points, covariances, labels, lines = self
-        return Points(points[chosen], covariances[chosen], labels[chosen], lines[chosen])
+        columns: Iterable[Any] = (column[chosen] for column in self)
+        return Points(*columns)
 
     def equals(self, other: "Points") -> bool:
         return np.array_equal(self.points, other.points) and np.array_equal(self.labels, other.labels)
@@ -222,13 +236,22 @@ def marker_points(array: Any, rule: LabelRule, namespaces: Sequence[str] = ()) -
 
     A strip of lines is a polyline. Markers are those of the namespaces, by default of all.
     """
-    rows = [
-        (*row, number if marker.type == LINE_STRIP else ALONE)
-        for number, marker in enumerate(_added(array.markers))
-        if not namespaces or marker.ns in namespaces
-        for row in _of_marker(marker, rule)
-    ]
-    return Points.of([row[:2] for row in rows], [row[2] for row in rows], lines=[row[3] for row in rows])
+    points, labels, lines = list[tuple[float, float]](), list[int](), list[int]()
+    for number, marker in enumerate(_added(array.markers)):
+        if namespaces and marker.ns not in namespaces:
+            continue
+        at, colours = marker.pose.position, [marker.color]
+        if marker.type in POINT_MARKERS:
+            points.append((at.x, at.y))
+        else:
+            yaw = yaw_of(marker.pose.orientation)
+            c, s = np.cos(yaw), np.sin(yaw)
+            points += [(at.x + c * p.x - s * p.y, at.y + s * p.x + c * p.y) for p in marker.points]
+            one_each = len(marker.colors) == len(marker.points)
+            colours = marker.colors if one_each else [marker.color] * len(marker.points)
+        labels += map(rule.of, colours)
+        lines += [number if marker.type == LINE_STRIP else ALONE] * len(colours)
+    return Points.of(points, labels, lines=lines)
 
 
 def _added(markers: Iterable[Any]) -> Iterator[Any]:
@@ -241,19 +264,6 @@ def namespaces_of(message: Any) -> list[str]:
     return [marker.ns for marker in _added(getattr(message, "markers", ()))]
 
 
-def _of_marker(marker: Any, rule: LabelRule) -> Iterator[tuple[float, float, int]]:
-    place = marker.pose.position
-    if marker.type in POINT_MARKERS:
-        yield place.x, place.y, rule.of(marker.color)
-        return
-    yaw = yaw_of(marker.pose.orientation)
-    c, s = np.cos(yaw), np.sin(yaw)
-    one_each = len(marker.colors) == len(marker.points)
-    for index, point in enumerate(marker.points):
-        colour = marker.colors[index] if one_each else marker.color
-        yield place.x + c * point.x - s * point.y, place.y + s * point.x + c * point.y, rule.of(colour)
-
-
 def cone_points(message: Any, rule: LabelRule) -> Points:
     """Cones in all lists of a message, as in `ConeArrayWithCovariance` and `Detection3DArray`.
 
@@ -261,20 +271,29 @@ def cone_points(message: Any, rule: LabelRule) -> Points:
     has its own. Its covariance has 4 (x, y), 9 (x, y, z) or 36 entries (a pose), row by row. What has a list
     of points in place of a position is a polyline.
     """
-    lists = {name: getattr(message, name) for name in _names(message)}
-    lists = {name: listed for name, listed in lists.items() if _is_list(listed)}
+    lists = _lists(message)
     if not lists:
         raise MessageError(f"expected a message with a list of cones, found the fields {_names(message)}")
     points, covariances = list[tuple[float, float]](), list[Array]()
     labels, numbers = list[int](), list[int]()
     for number, (name, one) in enumerate((name, one) for name, listed in lists.items() for one in listed):
         vertices = _vertices(one)
-        points += [_position(one)] if vertices is None else vertices
-        added = len(points) - len(labels)
-        labels += [_cone_label(name, one, rule)] * added
-        covariances += [_covariance(one)] * added
-        numbers += [ALONE if vertices is None else number] * added
+        found = [_position(one)] if vertices is None else vertices
+        label = next((label for word, label in LIST_NAMES.items() if word in name.lower()), None)
+        if label is None:
+            value = _label_value(one, rule.fields)
+            label = UNKNOWN if value is None else rule.of(value)
+        points += found
+        labels += [label] * len(found)
+        covariances += [_covariance(one)] * len(found)
+        numbers += [ALONE if vertices is None else number] * len(found)
     return Points.of(points, labels, covariances, numbers)
+
+
+def _lists(message: Any) -> dict[str, Any]:
+    """Lists of messages in a message, by field."""
+    fields = {name: getattr(message, name) for name in _names(message)}
+    return {name: value for name, value in fields.items() if _is_list(value)}
 
 
 def _is_list(value: Any) -> bool:
@@ -295,9 +314,8 @@ def _vertices(line: Any) -> list[tuple[float, float]] | None:
         return [(float(x), float(y)) for x, y in zip(line.x, line.y, strict=True)]
     if any(map(_place, _path(line))):
         return None
-    lists = [getattr(line, name) for name in _names(line) if name != "covariance"]
-    points = next((listed for listed in lists if _is_list(listed)), None)
-    return None if points is None else [*map(_position, points)]
+    lists = [points for name, points in _lists(line).items() if name != "covariance"]
+    return [*map(_position, lists[0])] if lists else None
 
 
 def _position(cone: Any) -> tuple[float, float]:
@@ -327,14 +345,6 @@ def _covariance(cone: Any) -> Array:
     entries = np.zeros(0) if holder is None else np.asarray(holder.covariance, dtype=float).ravel()
     side = {4: 2, 9: 3, 36: 6}.get(len(entries))
     return np.full((2, 2), np.nan) if side is None else entries.reshape(side, side)[:2, :2]
-
-
-def _cone_label(name: str, cone: Any, rule: LabelRule) -> int:
-    for word, label in LIST_NAMES.items():
-        if word in name.lower():
-            return label
-    value = _label_value(cone, rule.fields)
-    return UNKNOWN if value is None else rule.of(value)
 
 
 def _label_value(holder: Any, names: Sequence[str]) -> Any:

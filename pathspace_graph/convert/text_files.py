@@ -2,29 +2,19 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import pairwise
-from math import pi
+from math import nan, pi
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Final
+from typing import Final, NoReturn
 
 import numpy as np
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.covariances import covariances_of
-from pathspace_graph.io.parsing import (
-    DELIMITERS,
-    MAX_STAMP,
-    Table,
-    is_number,
-    read_table,
-    read_text,
-    shown,
-)
-from pathspace_graph.io.results import read_trajectory
+from pathspace_graph.io.parsing import MAX_STAMP, is_number, read_text, shown
+from pathspace_graph.io.tables import DELIMITERS, TUM, read_table, read_trajectory, read_tum
 from pathspace_graph.labels import UNKNOWN
 
 from .messages import ALONE, BROKEN, Points, cone_points, scan_points, yaw_of
@@ -46,7 +36,6 @@ QUANTITIES: Final = {  # columns of each file and their quantities; a covariance
 COVARIANCE: Final = ("xx", "xy", "yy")  # columns of the covariance of a detection, if there is one
 QUATERNION: Final = ("qx", "qy", "qz", "qw")  # columns of a rotation, in place of a yaw
 OTHER_NAMES: Final = {"x": "tx", "y": "ty", "yaw": "theta"}  # columns of a pose, by the usual ones
-TUM_COLUMNS: Final = 8  # number of columns of a trajectory in the format of TUM, which has no header
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {  # units of each quantity, in SI units
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3},
@@ -79,16 +68,15 @@ def read_csv(
     8601 dates, or seconds and nanoseconds in two columns (`t=sec+nsec`). The odometry has twists, or where
     they are missing or `from_poses` is stated poses, which may be a trajectory in the format of TUM.
     """
-    named, used = _named(columns), _units(units)
-    if _is_tum(odometry):
-        (t, motion), are_poses = read_trajectory(odometry), True
-        lines = enumerate(read_text(odometry).split("\n"), start=1)
-        rows = np.array([row for row, line in lines if line.strip() and not line.startswith("#")])
+    used = _units(units)
+    first = (line.split() for line in read_text(odometry).splitlines() if line.strip() and line[0] != "#")
+    words = next(first, [])
+    if len(words) == len(TUM) and all(map(is_number, words)):
+        (t, motion), are_poses, rows = read_trajectory(odometry), True, read_tum(odometry).rows
     else:
-        file = _File(ODOMETRY, read_table(odometry, (), delimiters=DELIMITERS), named, used)
-        motion, are_poses = _motion(file, from_poses=from_poses)
-        t, rows = file.stamps(), file.table.lines
-    scans = _scans(_File(DETECTIONS, read_table(detections, (), delimiters=DELIMITERS), named, used), rule)
+        file = _File(ODOMETRY, odometry, columns, used)
+        (motion, are_poses), t, rows = _motion(file, from_poses=from_poses), file.stamps(), file.table.rows
+    scans = _scans(_File(DETECTIONS, detections, columns, used), rule)
     in_words = ", ".join(f"{quantity} in {unit}" for quantity, unit in sorted(used.items()))
     return Recording(
         t,
@@ -103,23 +91,113 @@ def read_csv(
     )
 
 
-def _is_tum(file: Path) -> bool:
-    """Whether a file is a trajectory in the format of TUM: eight numbers in a row, between blanks."""
-    lines = (line for line in read_text(file).split("\n") if line.strip() and not line.startswith("#"))
-    words = next(lines, "").split()
-    return len(words) == TUM_COLUMNS and all(map(is_number, words))
+def _units(pairs: Sequence[str]) -> dict[str, str]:
+    """Units of the quantities; those of a `speed` and a `yaw_rate` follow the others."""
+    names = {"time": "s", "length": "m", "angle": "rad"}
+    for pair in pairs:
+        quantity, _, unit = pair.partition("=")
+        check_name(quantity, UNITS, f"--units: expected one of {', '.join(UNITS)} in '{pair}'")
+        if unit not in UNITS[quantity]:
+            known = ", ".join(UNITS[quantity])
+            raise SettingsError(f"--units: expected {quantity}= one of {known}, found '{pair}'")
+        names[quantity] = unit
+    return {"speed": f"{names['length']}/s", "yaw_rate": f"{names['angle']}/s", **names}
 
 
-def _motion(file: "_File", *, from_poses: bool) -> tuple[Array, bool]:
+class _File:
+    """One of the files, whose columns are read by quantity and in SI units."""
+
+    def __init__(self, kind: str, file: Path, pairs: Sequence[str], units: Mapping[str, str]) -> None:
+        self.named, self._units, self._quantities = dict[str, str](), units, QUANTITIES[kind]
+        for pair in pairs:
+            stated, _, name = pair.partition("=")
+            only, _, key = stated.rpartition(".")
+            if not name.removeprefix("-"):
+                raise SettingsError(f"--columns: expected QUANTITY=COLUMN, found '{pair}'")
+            known = {key: 0 for of, keys in QUANTITIES.items() if only in ("", of) for key in keys}
+            check_name(key, known, f"--columns: expected one of {', '.join(known)} in '{pair}'")
+            if only in ("", kind):
+                self.named[key] = name
+        self.table = read_table(file, delimiters=DELIMITERS)
+        if any(map(is_number, self.table.columns)):
+            found = f"found the numbers {', '.join(self.table.columns)}"
+            raise InputError(file, f"expected a header with the names of the columns, {found}", 1)
+        if not len(self.table):
+            raise InputError(file, "expected at least one row, found a header only", 2)
+
+    def has(self, key: str) -> bool:
+        """Whether the file has the column of a quantity; one that was named must be there."""
+        return key in self.named or key in self.table.columns
+
+    def find(self, key: str) -> str:
+        """Column of a quantity, by the name that was stated or by a usual one; empty without one."""
+        names = self.named.get(key, "").removeprefix("-"), key, OTHER_NAMES.get(key)
+        return next((name for name in names if name in self.table.columns), "")
+
+    def column(self, key: str, name: str = "") -> str:
+        """Column of a quantity, which must be there."""
+        name = name or self.named.get(key, key).removeprefix("-")
+        if name not in self.table.columns:
+            otherwise = f", or {key}=SECONDS+NANOSECONDS" * (key == "t")
+            pose = ", or a pose x, y, yaw" * (key in ("vx", "wz"))
+            self.fail(f"expected a column '{name}' for {key}{pose} (--columns {key}=NAME{otherwise})")
+        return name
+
+    def fail(self, expected: str) -> NoReturn:
+        """Raise an InputError that lists the columns."""
+        raise InputError(self.table.file, f"{expected}, found the columns {', '.join(self.table.columns)}", 1)
+
+    def numbers(self, key: str, power: int = 1, name: str = "") -> Array:
+        """A column (rows,) in the SI unit or, for `power` 2, its square; NaN where it is missing."""
+        quantity = self._quantities[key]
+        sign = -1.0 if self.named.get(key, "").startswith("-") else 1.0
+        factor = sign * (UNITS[quantity][self._units[quantity]] ** power if quantity else 1.0)
+        return np.asarray(factor * self.table.numbers(self.column(key, name), LARGEST, missing=True))
+
+    def stamps(self) -> Array:
+        """Stamps (rows,) in s: numbers, dates, or seconds and nanoseconds in two columns."""
+        stated, unit, table = self.named.get("t", "t"), self._units["time"], self.table
+        if "+" in stated and stated not in table.columns:
+            names = stated.split("+", 1)
+            t, fractions = (table.numbers(self.column("t", name), LARGEST) for name in names)
+            expected = f"expected nanoseconds from 0 to 999999999 in column '{names[1]}', found others"
+            table.require((fractions >= 0.0) & (fractions < 1e9), expected)
+            if len(t) >= MANY_ROWS and 0.0 < fractions.max() < LEAST_NANOSECONDS:
+                found = f"found at most {fractions.max():.0f}: is their unit another one?"
+                raise InputError(table.file, f"expected nanoseconds in column '{names[1]}', {found}")
+            t, unit = t + 1e-9 * fractions, "s"
+        elif np.isnan(seconds_of_date(table.columns[self.column("t")][0])):
+            t = UNITS["time"][unit] * table.numbers(self.column("t"), LARGEST)
+        else:
+            t, unit = np.array([seconds_of_date(text) for text in table.columns[self.column("t")]]), "s"
+            expected = f"expected a date by ISO 8601 in column '{stated}', as in the rows before"
+            table.require(~np.isnan(t), expected)
+        most = f"expected stamps of at most {MAX_STAMP:g} s in column '{stated}', found more"
+        table.require(np.abs(t) <= MAX_STAMP, f"{most}: is their unit not {unit} (--units time=ns)?")
+        stamps = np.unique(t)
+        period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
+        if not MIN_PERIOD < period < MAX_PERIOD:
+            found = f"found them {period:.3g} s apart: is their unit another one?"
+            raise InputError(table.file, f"expected stamps in {unit} in column '{stated}', {found}")
+        return np.asarray(t)
+
+
+def seconds_of_date(text: str) -> float:
+    """Time (s) since 1970 of a date with a time by ISO 8601, UTC without an offset; else NaN."""
+    try:
+        date = datetime.fromisoformat("" if is_number(text) else text.strip())
+    except ValueError:
+        return nan
+    return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
+
+
+def _motion(file: _File, *, from_poses: bool) -> tuple[Array, bool]:
     """Twists (rows, 3) or poses (rows, 3) of the odometry, with NaN where they are missing; and which."""
     x, y, yaw = (file.find(key) for key in ("x", "y", "yaw"))
     turned = [file.find(key) for key in QUATERNION]
     has_poses = bool(x and y and (yaw or all(turned)))
     if from_poses and not has_poses:
-        expected = (
-            "--from-poses: expected the columns x, y and yaw, or qx, qy, qz and qw (--columns yaw=NAME)"
-        )
-        raise InputError(file.table.file, f"{expected}, found {', '.join(file.table.columns)}", 1)
+        file.fail("--from-poses: expected the columns x, y and yaw, or a quaternion (--columns yaw=NAME)")
     if has_poses and (from_poses or not (file.has("vx") and file.has("wz"))):
         if not yaw:
             turn = (file.numbers(key, name=name) for key, name in zip(QUATERNION, turned, strict=True))
@@ -136,165 +214,29 @@ def _motion(file: "_File", *, from_poses: bool) -> tuple[Array, bool]:
     return twists, False
 
 
-def _named(pairs: Sequence[str]) -> dict[tuple[str, str], str]:
-    """Columns by kind of file and quantity, with a minus where the sign changes."""
-    named: dict[tuple[str, str], str] = {}
-    for pair in pairs:
-        key, equals, name = pair.partition("=")
-        if not equals or not name.removeprefix("-"):
-            raise SettingsError(f"--columns: expected QUANTITY=COLUMN, found '{pair}'")
-        only, _, key = key.rpartition(".")
-        known = dict.fromkeys(key for kind, keys in QUANTITIES.items() if only in ("", kind) for key in keys)
-        check_name(key, known, f"--columns: expected one of {', '.join(known)} in '{pair}'")
-        named |= {(kind, key): name for kind in ([only] if only else QUANTITIES)}
-    return named
-
-
-def _units(pairs: Sequence[str]) -> dict[str, str]:
-    """Units of the quantities; those of a `speed` and a `yaw_rate` follow the others."""
-    names = {"time": "s", "length": "m", "angle": "rad"}
-    for pair in pairs:
-        quantity, equals, unit = pair.partition("=")
-        check_name(quantity, UNITS, f"--units: expected one of {', '.join(UNITS)} in '{pair}'")
-        if not equals or unit not in UNITS[quantity]:
-            known = ", ".join(UNITS[quantity])
-            raise SettingsError(f"--units: expected {quantity}= one of {known}, found '{pair}'")
-        names[quantity] = unit
-    return {"speed": f"{names['length']}/s", "yaw_rate": f"{names['angle']}/s", **names}
-
-
-@dataclass(frozen=True)
-class _File:
-    """One of the files, whose columns are read by quantity and in SI units."""
-
-    kind: str
-    table: Table
-    named: dict[tuple[str, str], str]
-    units: dict[str, str]
-
-    def __post_init__(self) -> None:
-        if any(map(is_number, self.table.columns)):
-            found = f"found the numbers {', '.join(self.table.columns)}"
-            raise InputError(self.table.file, f"expected a header with the names of the columns, {found}", 1)
-        if not len(self.table):
-            raise InputError(self.table.file, "expected at least one row, found a header only", 2)
-
-    def has(self, key: str) -> bool:
-        """Whether the file has the column of a quantity; one that was named must be there."""
-        return (self.kind, key) in self.named or key in self.table.columns
-
-    def find(self, key: str) -> str:
-        """Column of a part of a pose, where there is one: as it was named, or by a usual name."""
-        stated = self.named.get((self.kind, key), "").removeprefix("-")
-        return next((name for name in (stated, key, OTHER_NAMES.get(key)) if name in self.table.columns), "")
-
-    def column(self, key: str, column: str = "") -> str:
-        """Column of a quantity, which must be there; it may be one of several `column`s."""
-        column = column or self.named.get((self.kind, key), key).removeprefix("-")
-        if column not in self.table.columns:
-            otherwise = f", or {key}=SECONDS+NANOSECONDS" * (key == "t")
-            pose = ", or a pose x, y, yaw" * (key in ("vx", "wz"))
-            expected = f"expected a column '{column}' for {key}{pose} (--columns {key}=NAME{otherwise})"
-            found = f"found the columns {', '.join(self.table.columns)}"
-            raise InputError(self.table.file, f"{expected}, {found}", 1)
-        return column
-
-    def numbers(self, key: str, power: int = 1, name: str = "") -> Array:
-        """A column (rows,) in the SI unit or, for `power` 2, its square; NaN where it is missing."""
-        quantity = QUANTITIES[self.kind][key]
-        sign = -1.0 if self.named.get((self.kind, key), "").startswith("-") else 1.0
-        factor = sign * (UNITS[quantity][self.units[quantity]] ** power if quantity else 1.0)
-        return np.asarray(factor * self.table.numbers(name or self.column(key), LARGEST, missing=True))
-
-    def stamps(self) -> Array:
-        """Stamps (rows,) in s: numbers, dates, or seconds and nanoseconds in two columns."""
-        stated, unit = self.named.get((self.kind, "t"), "t"), self.units["time"]
-        if "+" in stated and stated not in self.table.columns:
-            return self._checked(self._in_two_columns(*stated.split("+", 1)), "s")
-        name = self.column("t")
-        if seconds_of_date(self.table.columns[name][0]) is not None:
-            return self._checked(self._dates(name), "s")
-        return self._checked(UNITS["time"][unit] * self.table.numbers(name, LARGEST), unit)
-
-    def _in_two_columns(self, whole: str, fraction: str) -> Array:
-        """Stamps (rows,) in s of columns with seconds and with nanoseconds."""
-        seconds, nanoseconds = (
-            self.table.numbers(self.column("t", name), LARGEST) for name in (whole, fraction)
-        )
-        self.table.require(
-            (nanoseconds >= 0.0) & (nanoseconds < 1e9),
-            f"expected nanoseconds from 0 to 999999999 in column '{fraction}', found others",
-        )
-        if len(seconds) >= MANY_ROWS and 0.0 < nanoseconds.max() < LEAST_NANOSECONDS:
-            found = f"found at most {nanoseconds.max():.0f}: is their unit another one?"
-            raise InputError(self.table.file, f"expected nanoseconds in column '{fraction}', {found}")
-        return np.asarray(seconds + 1e-9 * nanoseconds)
-
-    def _dates(self, name: str) -> Array:
-        seconds = [seconds_of_date(text) for text in self.table.columns[name]]
-        good = np.array([one is not None for one in seconds])
-        self.table.require(good, f"expected a date by ISO 8601 in column '{name}', as in the rows before")
-        return np.array(seconds, dtype=float)
-
-    def _checked(self, t: Array, unit: str) -> Array:
-        """Stamps (rows,) in s, which must be plausible where they were in this unit."""
-        name = self.named.get((self.kind, "t"), "t")
-        self.table.require(
-            np.abs(t) <= MAX_STAMP,
-            f"expected stamps of at most {MAX_STAMP:g} s in column '{name}', found more: is their unit not "
-            f"{unit} (--units time=ns)?",
-        )
-        stamps, expected = np.unique(t), f"expected stamps in {unit} in column '{name}'"
-        period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-        if len(stamps) > 1 and not MIN_PERIOD < period < MAX_PERIOD:
-            found = f"found them {period:.3g} s apart: is their unit another one?"
-            raise InputError(self.table.file, f"{expected}, {found}")
-        return t
-
-
-def seconds_of_date(text: str) -> float | None:
-    """Time (s) since 1970 of a date with a time by ISO 8601, UTC without an offset; else None."""
-    text = text.strip()
-    if is_number(text):
-        return None
-    try:
-        date = datetime.fromisoformat(text)
-    except ValueError:
-        return None
-    return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
-
-
-def _scans(file: _File, rule: LabelRule) -> tuple[Array, list[Points]]:
-    """Stamps of the perception cycles (n,) in s, and the points of each, in the file's order."""
-    t, points, covariances = file.stamps(), _points(file), None
-    labels = np.full(len(t), UNKNOWN)
+def _scans(file: _File, rule: LabelRule) -> tuple[Array, Points]:
+    """Stamps of the perception cycles (n,) in s, and their points, in the file's order."""
+    t, points, table = file.stamps(), _points(file), file.table
+    covariances, labels, lines = None, np.full(len(t), UNKNOWN), np.full(len(t), ALONE)
     if any(map(file.has, COVARIANCE)):
         covariances = covariances_of(*(file.numbers(key, power=2) for key in COVARIANCE))
     if file.has("label"):
-        labels = rule.of_all(np.array(file.table.columns[file.column("label")]))
-    lines: Any = ALONE
-    if (DETECTIONS, "line") in file.named:
-        lines = np.unique(file.table.columns[file.column("line")], return_inverse=True)[1]
-    starts = np.flatnonzero(np.diff(t, prepend=np.nan))
+        labels = rule.of_all(table.columns[file.column("label")])
+    if "line" in file.named:
+        lines = np.unique(table.columns[file.column("line")], return_inverse=True)[1]
+    begins = np.diff(t, prepend=np.nan) != 0.0
     detections = Points.of(points, labels, covariances, lines)
-    spans = [slice(*span) for span in pairwise([*starts.tolist(), len(t)])]
-    return t[starts], [detections.where(span) for span in spans]
+    return t[begins], detections._replace(message=np.cumsum(begins) - 1)
 
 
 def _points(file: _File) -> Array:
-    if file.has("x") and (DETECTIONS, "range") not in file.named:
+    if file.has("x") and "range" not in file.named:
         return np.column_stack([file.numbers("x"), file.numbers("y")])
     if not (file.has("range") and file.has("bearing")):
-        expected = "expected the columns x and y, or range and bearing (--columns x=NAME)"
-        found = f"found the columns {', '.join(file.table.columns)}"
-        raise InputError(file.table.file, f"{expected}, {found}", 1)
+        file.fail("expected the columns x and y, or range and bearing (--columns x=NAME)")
     ranges, bearings = file.numbers("range"), file.numbers("bearing")
-    name, unit = file.column("bearing"), file.units["angle"]
-    file.table.require(
-        ~(np.abs(bearings) > MAX_BEARING),
-        f"expected bearings of at most a whole turn in column '{name}', found more: is their unit not {unit} "
-        "(--units angle=deg)?",
-    )
+    most = f"expected bearings of at most a whole turn in column '{file.column('bearing')}', found more"
+    file.table.require(~(np.abs(bearings) > MAX_BEARING), f"{most}: are they in degrees (--units angle=deg)?")
     file.table.require(~(ranges < 0.0), f"expected ranges of at least 0 in column '{file.column('range')}'")
     return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
 
@@ -333,17 +275,15 @@ def read_json_lines(
     if from_poses and not moved["pose"]:
         raise InputError(file, "--from-poses: expected lines with pose [x, y, yaw], found none")
     entries = moved["pose" if are_poses else "twist"]
-    rows, t = (np.array([entry[k] for entry in entries]) for k in range(2))
-    motion = np.array([entry[2] for entry in entries]).reshape(-1, 3)
     return Recording(
-        np.asarray(t, float),
-        motion,
+        np.array([t for _, t, _ in entries]),
+        np.array([motion for _, _, motion in entries]).reshape(-1, 3),
         np.array(scan_t),
-        scans,
+        Points.joined(scans),
         {"file": file.name},
         are_poses=are_poses,
         is_held=held,
-        rows=rows,
+        rows=np.array([row for row, _, _ in entries], int),
         place=f"{file.name}, line",
     )
 
@@ -354,5 +294,4 @@ def _points_of_line(entry: SimpleNamespace, rule: LabelRule) -> Iterator[Points]
         if hasattr(entry, name):
             yield cone_points(SimpleNamespace(**{name: getattr(entry, name)}), rule)
     if hasattr(entry, "scan"):
-        scan = SimpleNamespace(**{"range_min": 0.0, "range_max": np.inf, **vars(entry.scan)})
-        yield scan_points(scan)
+        yield scan_points(SimpleNamespace(**{"range_min": 0.0, "range_max": np.inf, **vars(entry.scan)}))

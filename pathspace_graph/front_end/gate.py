@@ -24,7 +24,6 @@ from pathspace_graph.io.log import (
     Detections,
     Log,
     Odometry,
-    read_log,
 )
 from pathspace_graph.labels import LEFT, NAMES
 from pathspace_graph.run import CycleResult, split_odometry
@@ -107,17 +106,6 @@ class Gate(Copyable):
 
     def refuse(self) -> None:
         self.refused += 1
-
-
-def read_usable_log(folder: Path, limits: LimitSettings, scale: float | None = None) -> Log:
-    """Read a log and check all its cycles; an unusable one raises an InputError with file, row and stamp.
-
-    A `scale` of the scene replaces that of the log.
-    """
-    log = read_log(folder)
-    log = log if scale is None else replace(log, scale=scale)
-    check_usable(log, folder, limits)
-    return log
 
 
 def check_usable(log: Log, folder: Path, limits: LimitSettings) -> None:

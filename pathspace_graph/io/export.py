@@ -18,10 +18,9 @@ from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.centre_line import find_line
 from pathspace_graph.spline.planning import speed_profile
 
-from .files import to_plain
+from .files import to_plain, write_table
 from .log import COLUMNS, TRUTH_CONES_FILE
 from .map import Map, MapBoundary, PointBoundary, SplineBoundary
-from .parsing import write_table
 
 CENTRE_LINE: Final = ("# x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # columns of TUM's raceline format
 PROFILE: Final = ("# s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2")  # of its trajectories

@@ -1,5 +1,6 @@
 """Output that appears as a whole or not at all, and never costs an earlier result by mistake."""
 
+import csv
 import ctypes
 import json
 import math
@@ -8,13 +9,14 @@ import re
 import secrets
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pathspace_graph.errors import OutputError
 
@@ -30,7 +32,7 @@ def atomic_folder(target: Path | str, marker: str, *, force: bool = False) -> It
     """
     final = _followed(target)
     check_target(final, marker, force=force)
-    with _parents(final), _beside(final, Path.mkdir) as temporary:
+    with _beside(final, Path.mkdir) as temporary:
         yield temporary
         check_target(final, marker, force=force)
         with suppress(OSError):
@@ -84,7 +86,7 @@ def is_stream(path: Path) -> bool:
 @contextmanager
 def replacing(file: Path) -> Iterator[Path]:
     """Yield a temporary path beside `file` that takes its place on success."""
-    with _parents(file), _beside(file, Path.touch) as temporary:
+    with _beside(file, Path.touch) as temporary:
         yield temporary
         temporary.replace(file)
 
@@ -111,6 +113,15 @@ def to_plain(value: Any) -> Any:
 def write_json(file: Path, content: Any, indent: int | None = 2) -> None:
     """Write the content as strict JSON, see `to_plain`, and replace an earlier file."""
     write_text(file, json.dumps(to_plain(content), indent=indent, allow_nan=False) + "\n")
+
+
+def write_table(file: Path, names: Iterable[str], *values: ArrayLike) -> None:
+    """Write a CSV file of columns (rows,) or (rows, k); numbers read back as the same ones."""
+    columns = [column for value in values for column in np.atleast_2d(np.asarray(value).T).tolist()]
+    with file.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(names)
+        writer.writerows(zip(*columns, strict=True))
 
 
 # --- checks of the target -------------------------------------------------------------------------------
@@ -163,13 +174,25 @@ def _check_parents(target: Path) -> None:
 
 
 @contextmanager
-def _parents(final: Path) -> Iterator[None]:
-    """Make the folders above a path, and remove them on failure; errors of the disk name the path."""
+def _beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
+    """Yield a new path beside `final`, made by `make`; what is there at the end is removed.
+
+    Folders above are made, and removed on failure. An error of the disk names `final`.
+    """
     missing = [parent for parent in final.parents if not parent.exists()]
+    # the suffix stays last, as writers choose the format by it
+    path = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.tmp{final.suffix}")
     with _naming(final):
         try:
             final.parent.mkdir(parents=True, exist_ok=True)
-            yield
+            make(path)
+            try:
+                yield path
+            finally:
+                if path.is_dir():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
         except BaseException:
             for parent in missing:
                 with suppress(OSError):
@@ -193,18 +216,3 @@ def _naming(final: Path) -> Iterator[None]:
 
 def is_temporary(name: str) -> bool:
     return re.fullmatch(r"\..*\.[0-9a-f]{8}\.tmp(\.[^.]*)?", name) is not None
-
-
-@contextmanager
-def _beside(final: Path, make: Callable[[Path], None]) -> Iterator[Path]:
-    """Yield a new path beside `final`, made by `make`; what is there at the end is removed."""
-    # the suffix stays last, as writers choose the format by it
-    path = final.with_name(f".{final.stem}.{secrets.token_hex(4)}.tmp{final.suffix}")
-    make(path)
-    try:
-        yield path
-    finally:
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)

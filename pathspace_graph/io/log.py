@@ -1,4 +1,4 @@
-"""A log: odometry, perception cycles and, where known, the truth; it is read from and written to a folder."""
+"""A log: odometry, perception cycles and, where known, the truth; `log_files` reads and writes its folder."""
 
 from __future__ import annotations
 
@@ -9,21 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
-from msgspec.structs import asdict
 from numpy.typing import ArrayLike
 
-from pathspace_graph.errors import InputError, check_type
+from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.labels import NAMES, UNKNOWN, Kind, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
 
-from . import header as headers
 from . import parsing as limits
 from .brief import Brief, pictures
 from .covariances import SIGMA_DETECTIONS, covariances_of, is_positive_definite, ray_covariances
-from .files import atomic_folder
-from .parsing import Column, Table, read_table, write_table
+from .parsing import Column, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -37,7 +34,7 @@ TRUTH_ASSOCIATIONS_FILE: Final = "truth_associations.csv"
 
 _STAMP: Final = {"t": Column(limits.MAX_STAMP, "s")}
 _POINT: Final = {"x": Column(unit="m"), "y": Column(unit="m")}
-_LABEL: Final = Column(len(NAMES) - 1, read=label_from_name)
+_LABEL: Final = Column(len(NAMES) - 1)
 _SPEED: Final = Column(limits.MAX_SPEED, "m/s")
 _RANGE: Final = Column(limits.MAX_RANGE, "m")
 _COVARIANCE: Final = Column(limits.MAX_RANGE**2, "m^2")
@@ -237,11 +234,11 @@ class Log:
         K = np.asarray(ray_covariances(points, SIGMA_DETECTIONS) if m is None else m, float).reshape(-1, 4)
         words = [label_from_name(one) if isinstance(one, str) else one for one in labels or ()]
         labelled = words if labels is not None else np.full(len(points), UNKNOWN)
-        odometry = _read_odometry(_of_arrays(ODOMETRY_FILE, t, twist))
+        odometry = odometry_of(_of_arrays(ODOMETRY_FILE, t, twist))
         found = _of_arrays(DETECTIONS_FILE, detection_t, points, labelled, K[:, [0, 1, 3]])
         return cls(
             odometry,
-            _cycles(found, float(odometry.t[0]), float(odometry.t[-1])),
+            cycles_in(found, float(odometry.t[0]), float(odometry.t[-1])),
             np.array(SIGMA_ODOMETRY if s is None else s, float),
             SensorInfo(kind=kind),
             odometry_stated=s is not None,
@@ -261,61 +258,15 @@ class Log:
         return scaled(KnownNoise(self.odometry_sigma, *stated, self.measured, scale, drift), 1.0 / self.scale)
 
 
-def read_log(folder: Path | str) -> Log:
-    """Read and check a log folder; an InputError names the file, the row and what was expected."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
-    file = folder / LOG_FILE
-    header = headers.read_header(file)
-    odometry, table = _read_odometry(_table(folder, ODOMETRY_FILE)), _table(folder, DETECTIONS_FILE)
-    return Log(
-        odometry=odometry,
-        cycles=_cycles(table, float(odometry.t[0]), float(odometry.t[-1])),
-        odometry_sigma=np.array(header.odometry.sigma),
-        sensor=SensorInfo(**asdict(header.sensor)),
-        source={key: str(value) for key, value in header.source.items()},
-        odometry_stated=header.noise.odometry == headers.STATED,
-        detections_stated=header.noise.detections == headers.STATED,
-        odometry_drift=None if (drift := header.odometry.drift_sigmas) is None else np.array(drift),
-        measured=headers.measured_noise(header, file),
-        truth=_read_truth(folder, len(table), headers.true_errors(header, file)),
-        scale=header.scale,
-    )
-
-
-def _table(folder: Path, name: str) -> Table:
-    """Read a table of a log; an unknown one of the truth has no rows."""
-    if name in TRUTH_FILES and not (folder / name).exists():
-        return Table.of_arrays(folder / name, COLUMNS[name], np.zeros((0, len(COLUMNS[name]))))
-    return read_table(folder / name, COLUMNS[name])
-
-
 def _of_arrays(name: str, *values: ArrayLike) -> Table:
     return Table.of_arrays(Path(name).with_suffix(""), COLUMNS[name], *values)
 
 
-def write_log(log: Log, folder: Path | str, *, check: bool = False, force: bool = False) -> None:
-    """Write a log folder that `read_log` gives back exactly, but for cycles without detections.
-
-    It is written as by `atomic_folder`, and replaces an earlier log if `force`; with `check`, a log that
-    cannot be read is an InputError instead.
-    """
-    check_type("log", log, Log)
-    with atomic_folder(folder, LOG_FILE, force=force) as target:
-        (target / LOG_FILE).write_text(
-            headers.to_toml(_sections(log), log.scale), encoding="utf-8", newline="\n"
-        )
-        for name, values in _columns(log).items():
-            write_table(target / name, COLUMNS[name], *values)
-        if check:
-            read_log(target)
-
-
-def _read_odometry(table: Table) -> Odometry:
+def odometry_of(table: Table) -> Odometry:
+    """Check and take the odometry of a table."""
     if not len(table):
         raise InputError(table.file, "expected at least one row, found a header only", 2)
-    t, speeds = _increasing_times(table), table.stack(("vx", "vy"))
+    t, speeds = increasing_times(table), table.stack(("vx", "vy"))
     held = np.abs(speeds[:-1]).max(axis=1) * np.diff(t)
     too_far = f"expected a twist that moves the vehicle by at most {limits.MAX_HELD:g} m until the next row"
     table.require(np.append(held <= limits.MAX_HELD, True), too_far)
@@ -324,13 +275,15 @@ def _read_odometry(table: Table) -> Odometry:
     return Odometry(t, np.column_stack([speeds, table.numbers("wz")]))
 
 
-def _increasing_times(table: Table) -> Array:
+def increasing_times(table: Table) -> Array:
+    """Check and take the stamps (rows,) of a table, each later than the one before (s)."""
     t = table.numbers("t")
     table.require(np.diff(t, prepend=-np.inf) > 0, "expected a time later than the row before")
     return t
 
 
-def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ...]:
+def cycles_in(table: Table, t_first: float, t_last: float) -> tuple[Detections, ...]:
+    """Check and take the cycles of a table, beside an odometry from `t_first` to `t_last` (s)."""
     t = table.numbers("t")
     table.require(np.diff(t, prepend=t[:1]) >= 0, "expected a time not earlier than the row before")
     table.require(t >= t_first, f"expected a time not before the first odometry row ({t_first:g} s)")
@@ -343,15 +296,16 @@ def _cycles(table: Table, t_first: float, t_last: float) -> tuple[Detections, ..
     counts = [len(cycle.labels) for cycle in cycles]
     if max(counts, default=0) > limits.MAX_DETECTIONS:
         first = sum(counts[: int(np.argmax(counts))])
-        table.fail(first, f"expected at most {limits.MAX_DETECTIONS} detections in a cycle, found more")
+        expected = f"expected at most {limits.MAX_DETECTIONS} detections in a cycle, found more"
+        raise InputError(table.file, expected, int(table.rows[first]))
     return cycles
 
 
 def cycles_of(t: Array, points: Array, covariances: Array, labels: IntArray) -> tuple[Detections, ...]:
     """Group detections (m,) at stamps (s) to perception cycles, see `is_one_cycle`."""
     starts: list[int] = []
-    for row, stamp in enumerate(t.tolist()):
-        if not starts or not is_one_cycle(stamp, t[starts[-1]]):
+    for row in np.flatnonzero(np.diff(t, prepend=np.nan)).tolist():  # of rows with another stamp
+        if not starts or not is_one_cycle(t[row], t[starts[-1]]):
             starts.append(row)
     spans = [slice(a, b) for a, b in pairwise([*starts, len(t)])]
     return tuple(Detections(float(t[s.start]), points[s], covariances[s], labels[s]) for s in spans)
@@ -366,58 +320,9 @@ def is_one_cycle(t: float, begin: float) -> bool:
 
 
 def labels_of(table: Table) -> IntArray:
-    return table.numbers("label").astype(int)
-
-
-def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) -> Truth | None:
-    known = [(folder / name).exists() for name in TRUTH_FILES]
-    if not errors and not any(known):
-        return None
-    poses, cones, table = (_table(folder, name) for name in TRUTH_FILES)
-    t, placed, points = _increasing_times(poses), poses.stack(("x", "y", "theta")), cones.stack(("x", "y"))
-    associations = _associations(table, detection_count, len(points)) if known[-1] else None
-    return Truth(t, placed, points, labels_of(cones), associations, **errors)
-
-
-def _associations(table: Table, detection_count: int, cone_count: int) -> IntArray:
-    if len(table) != detection_count:
-        expected = f"a row for each of {detection_count} detections"
-        raise InputError(table.file, f"expected {expected}, found {len(table)}")
-    cones = table.numbers("cone")
-    good = (cones == np.floor(cones)) & (cones >= -1) & (cones < cone_count)
-    table.require(good, f"expected -1 or the index of one of {cone_count} true cones")
-    return cones.astype(int)
-
-
-def _sections(log: Log) -> dict[str, dict[str, Any]]:
-    truth = dict[str, Any]()
-    for name, entries in headers.TRUE_ERRORS.items():
-        values = getattr(log.truth, name, None)
-        truth |= {} if values is None else dict(zip(entries, values, strict=True))
-    return {
-        "odometry": {"sigma": log.odometry_sigma, "drift_sigmas": log.odometry_drift},
-        "sensor": vars(log.sensor),
-        **headers.noise_sections(log.odometry_stated, log.detections_stated, log.measured),
-        "source": {headers.toml_text(key): value for key, value in log.source.items()},
-        **({"truth": truth} if truth else {}),
-    }
-
-
-def _columns(log: Log) -> dict[str, tuple[Any, ...]]:
-    cycles, truth = log.cycles, log.truth
-    covariances = np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in cycles)])
-    columns: dict[str, tuple[Any, ...]] = {
-        ODOMETRY_FILE: (log.odometry.t, log.odometry.twist),
-        DETECTIONS_FILE: (
-            [cycle.t for cycle in cycles for _ in cycle.labels],
-            np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in cycles)]),
-            [NAMES[label] for cycle in cycles for label in cycle.labels],
-            covariances[:, [0, 0, 1], [0, 1, 1]],
-        ),
-    }
-    if truth is not None:
-        columns[TRUTH_POSES_FILE] = truth.pose_t, truth.poses
-        columns[TRUTH_CONES_FILE] = truth.cones, [NAMES[label] for label in truth.cone_labels]
-        if truth.associations is not None:
-            columns[TRUTH_ASSOCIATIONS_FILE] = (truth.associations,)
-    return columns
+    """Labels (rows,) of words or of numbers."""
+    column = table.columns["label"]
+    if column.dtype != object:
+        return table.numbers("label").astype(int)
+    known = {word: label_from_name(word) for word in set(column)}
+    return np.array([known[word] for word in column], dtype=int)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Self
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -14,6 +14,7 @@ from scipy.linalg import block_diag
 
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import move_points, rotation
 from pathspace_graph.labels import BOUNDARIES, LABELS, LEFT, NAMES, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.planning import CentreLine, centre_line
@@ -52,6 +53,11 @@ class SplineBoundary(Brief):
         """Number m of distinct control points."""
         return self.spline.size
 
+    def moved(self, motion: Array) -> Self:
+        """Move the boundary by a motion (3,); parameters along it stay."""
+        spline = replace(self.spline, control_points=move_points(motion, self.spline.control_points))
+        return replace(self, spline=spline, covariance=_turned(self.covariance, motion))
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointBoundary(Brief):
@@ -67,6 +73,11 @@ class PointBoundary(Brief):
     @property
     def size(self) -> int:
         return len(self.points)
+
+    def moved(self, motion: Array) -> Self:
+        """Move the points by a motion (3,)."""
+        covariance = _turned(self.covariance, motion)
+        return replace(self, points=move_points(motion, self.points), covariance=covariance)
 
 
 MapBoundary = SplineBoundary | PointBoundary
@@ -132,6 +143,13 @@ class Map:
             raise SettingsError(f"map.{NAMES[label]}: expected a mapped boundary, found none")
         return self.boundaries[label]
 
+    def moved(self, motion: Array) -> Self:
+        """Move the map and its covariances by a motion (3,) of its frame."""
+        boundaries = {label: one.moved(motion) for label, one in self.boundaries.items()}
+        points = {label: one.moved(motion) for label, one in self.points.items()}
+        joint = None if self.joint_covariance is None else _turned(self.joint_covariance, motion)
+        return replace(self, boundaries=boundaries, joint_covariance=joint, points=points)
+
     def plot(self, **options: Any) -> Figure:
         """Draw the map; the options are those of `eval.figures.map_plot.plot_map`."""
         figure: Figure = pictures().plot_map(self, **options)
@@ -179,6 +197,13 @@ class Map:
         if any(boundary.covariance.shape[0] != 2 * boundary.size for boundary in (left, right)):
             return None
         return np.asarray(block_diag(left.covariance, right.covariance))
+
+
+def _turned(covariance: Array, motion: Array) -> Array:
+    """Rotate a covariance (2m, 2m) of points."""
+    turn, count = rotation(float(motion[2])), len(covariance) // 2
+    turned = np.einsum("ij,ajbk,lk->aibl", turn, covariance.reshape(count, 2, count, 2), turn)
+    return np.asarray(turned.reshape(covariance.shape), np.float64)
 
 
 def joint_covariance(joint: Array, boundaries: Mapping[int, MapBoundary]) -> Array:

@@ -3,12 +3,13 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_type_hints
+
+import msgspec
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.parsing import MAX_HEADER_BYTES, parse_json, parse_toml, read_text, shown
-from pathspace_graph.settings.checked import in_words, is_of
+from pathspace_graph.settings.checked import in_words
 
 T = TypeVar("T")
 Overrides = Mapping[str, Any]  # new values by dotted field
@@ -75,20 +76,11 @@ def _set(settings: Any, path: list[str], value: Any, where: str) -> Any:
 
 
 def as_type(value: Any, hint: Any, where: str) -> Any:
-    """Convert a value of TOML to the type of a field: a list to a tuple, a whole number to a float."""
-    fitting = _converted(value, hint)
-    if not is_of(fitting, hint):
-        raise SettingsError(f"{where}: expected {in_words(hint)}, found {shown(value)}")
-    return fitting
-
-
-def _converted(value: Any, hint: Any) -> Any:
-    arguments = get_args(hint)
-    if get_origin(hint) in (Union, UnionType):
-        return value if value is None else _converted(value, arguments[arguments[0] is NoneType])
-    if get_origin(hint) is tuple and isinstance(value, list | tuple):
-        each = arguments[:1] * len(value) if arguments[-1] is ... else arguments
-        return tuple(map(_converted, value, each)) if len(each) == len(value) else value
-    if hint is float and (type(value) is int or value in ("inf", "-inf")):  # JSON has these as texts
-        return float(value)
-    return value
+    """Convert a value of TOML or JSON to the type of a field, such as a list to a tuple."""
+    plain = value.tolist() if hasattr(value, "tolist") else value  # NumPy's numbers are numbers
+    if isinstance(plain, str) and plain in ("inf", "-inf"):  # JSON has these as texts
+        plain = float(plain)
+    try:
+        return msgspec.convert(plain, hint)
+    except (msgspec.ValidationError, OverflowError):
+        raise SettingsError(f"{where}: expected {in_words(hint)}, found {shown(value)}") from None

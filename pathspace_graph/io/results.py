@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Self
@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+from pathspace_graph.factors.se2 import compose
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
+from pathspace_graph.provenance import made
 
 from .brief import Brief, frames
-from .files import atomic_folder, write_json
+from .files import atomic_folder, write_json, write_table
 from .header import CALIBRATION
 from .map import MAP_FILE, Map, map_to_json
-from .parsing import MAX_COORDINATE, MAX_STAMP, is_plain, read_text, shown, write_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 TRAJECTORY_FILE: Final = "trajectory.tum"
 SMOOTHED_FILE: Final = "smoothed.tum"
 DRIVES_FOLDER: Final = "drives"  # of the folders of the drives, where several were mapped at once
-_COLUMNS: Final = 8
 NoiseSource = Literal["stated", "measured", "assumed"]  # by the log, by the drive, by default
 
 
@@ -42,28 +41,6 @@ def write_trajectory(file: Path, t: ArrayLike, poses: ArrayLike) -> None:
         for stamp, x, y, theta in rows.tolist():
             qz, qw = float(np.sin(theta / 2)), float(np.cos(theta / 2))
             out.write(f"{stamp!r} {x!r} {y!r} 0.0 0.0 0.0 {qz!r} {qw!r}\n")
-
-
-def read_trajectory(file: Path) -> tuple[Array, Array]:
-    """Read stamps (n,) in s and poses [x, y, theta] (n, 3), map frame; an InputError names a wrong row."""
-    lines = enumerate(read_text(file, "a trajectory").split("\n"), start=1)
-    rows = [_values(file, line, n) for n, line in lines if line.strip() and not line.startswith("#")]
-    values = np.array(rows).reshape(-1, _COLUMNS)
-    theta = 2 * np.arctan2(values[:, 6], values[:, 7])
-    return values[:, 0], np.column_stack([values[:, 1:3], theta])
-
-
-def _values(file: Path, line: str, number: int) -> list[float]:
-    try:
-        values = [float(word) for word in line.split()] if is_plain(line) else []
-    except ValueError:
-        values = []
-    if len(values) != _COLUMNS or not np.isfinite(values).all():
-        raise InputError(file, f"expected {_COLUMNS} finite numbers (t tx ty tz qx qy qz qw)", number)
-    if abs(values[0]) > MAX_STAMP or max(map(abs, values[1:])) > MAX_COORDINATE:
-        limits = f"a stamp of at most {MAX_STAMP:g} s and coordinates of at most {MAX_COORDINATE:g} m"
-        raise InputError(file, f"expected {limits}, found {shown(line.strip())}", number)
-    return values
 
 
 CYCLES_FILE: Final = "cycles.csv"
@@ -238,6 +215,10 @@ class RunResult:
         paths = {"trajectory": self.trajectory, "smoothed": self.smoothed}
         return self.map.plot(**paths, health=health, **options)
 
+    def moved(self, motion: Array) -> Self:
+        """Move the last map and the trajectory by a motion (3,) of their frame."""
+        return replace(self, map=self.map.moved(motion), trajectory=compose(motion, self.trajectory))
+
     def at_scale_one(self) -> Self:
         """Rescale the result to the size of a Formula Student track."""
         return scaled(self, 1.0 / self.scale)
@@ -264,7 +245,7 @@ def write_result(
     """Write map.json, the trajectories, cycles.csv and summary.json to a folder, as by `atomic_folder`.
 
     An earlier map is replaced if `force`. Where several drives were mapped at once, trajectory and cycles of
-    each are in a folder of its name.
+    each are in a folder of its name. The summary also says by which commit, where and when it was `made`.
     """
     with atomic_folder(folder, MAP_FILE, force=force) as temporary:
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
@@ -273,7 +254,7 @@ def write_result(
             own = temporary / DRIVES_FOLDER / name
             own.mkdir(parents=True)
             _write_drive(own, drive)
-        write_json(temporary / "summary.json", summary)
+        write_json(temporary / "summary.json", {**summary, "made": made()})
 
 
 def _write_drive(folder: Path, result: RunResult) -> None:

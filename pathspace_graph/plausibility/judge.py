@@ -14,12 +14,14 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.front_end.gate import read_usable_log
+from pathspace_graph.front_end.gate import check_usable
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.covariances import covariances_of
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
-from pathspace_graph.io.parsing import read_table, shown
+from pathspace_graph.io.log_files import read_log
+from pathspace_graph.io.parsing import shown
+from pathspace_graph.io.tables import read_table
 from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.settings.online import LimitSettings
 
@@ -390,6 +392,17 @@ NO_LABEL_WORDS: Final = frozenset({"unknown", "", "none", "nan", "null"})  # wor
 # causes of a refusal, by the size of numbers; labels and frames are never the cause
 REFUSABLE: Final = {"stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances"}
 SHOWN_WORDS: Final = 3  # largest number of foreign labels in a hint
+
+
+def read_usable_log(folder: Path, limits: LimitSettings, scale: float | None = None) -> Log:
+    """Read a log and check all its cycles; an unusable one raises an InputError with file, row and stamp.
+
+    A `scale` of the scene replaces that of the log.
+    """
+    log = read_log(folder)
+    log = log if scale is None else replace(log, scale=scale)
+    check_usable(log, folder, limits)
+    return log
 
 
 def read_plausible_log(

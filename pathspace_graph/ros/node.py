@@ -19,7 +19,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.convert.messages import BROKEN, frame_of, pose_of, stamp_of
-from pathspace_graph.convert.recording import ASSUMED, MessageStream
+from pathspace_graph.convert.recording import ASSUMED
 from pathspace_graph.convert.settings import Frames
 from pathspace_graph.errors import PathspaceError, SettingsError
 from pathspace_graph.factors.arrays import Array
@@ -31,6 +31,8 @@ from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, map_to_json, r
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult
+
+from .stream import MessageStream
 
 STEP: Final = 1.0  # distance of the published points of a boundary (m)
 AHEAD: Final = 20.0  # distance up to which the road ahead is published (m)

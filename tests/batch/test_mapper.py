@@ -24,7 +24,8 @@ from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.alignment import aligned_distance
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.graph.variables import CALIBRATION_KEY
-from pathspace_graph.io.log import Log, write_log
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import SplineBoundary, read_map
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State

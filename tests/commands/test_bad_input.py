@@ -63,24 +63,6 @@ def test_a_missing_column(name: str, column: str, log: Path) -> None:
     assert f"expected a column '{column}'" in line
 
 
-@pytest.mark.parametrize("value", ["fast", "nan", "inf", "-inf", "", "1e999"])
-@pytest.mark.parametrize(
-    ("name", "column"),
-    [
-        (name, column)
-        for name in TABLES
-        for column in GOOD[name].splitlines()[0].split(",")
-        if column != "label"
-    ],
-)
-def test_no_finite_number(name: str, column: str, value: str, log: Path) -> None:
-    (log / name).write_text(with_cell(GOOD[name], 3, column, value))
-    line = refusal(log)
-    assert f"{log / name}, row 3" in line
-    assert "expected" in line
-    assert f"'{column}'" in line
-
-
 @pytest.mark.parametrize(("command", "out"), [("online", "map"), ("batch", "map"), ("compare", "table")])
 @pytest.mark.parametrize(("column", "value"), [("vx", "900"), ("vy", "-101"), ("wz", "10.5")])
 def test_a_motion_that_no_vehicle_can_make(

@@ -18,7 +18,8 @@ from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.commands import estimate as commands_estimate
 from pathspace_graph.graph.elimination import Elimination
-from pathspace_graph.io.log import Detections, Log, Odometry, read_log, write_log
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.map import Map, read_map
 from pathspace_graph.io.results import LapBatches, RunResult
 from pathspace_graph.labels import LEFT, NAMES, RIGHT

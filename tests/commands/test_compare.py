@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.io.log import read_log, write_log
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.map import read_map
 
 from ..scenes.rings import register, write_logs

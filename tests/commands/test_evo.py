@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.io.log import Log, write_log
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.log_files import write_log
 
 from ..scenes.drives import short_drive
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.io.log import read_log
+from pathspace_graph.io.log_files import read_log
 
 from ..scenes.pretenders import Fragile, contents, register, write_round_track
 

@@ -11,9 +11,9 @@ import pytest
 from pathspace_graph.batch.placement import OTHER_TRACK
 from pathspace_graph.cli import main
 from pathspace_graph.commands.estimate import unique_names
-from pathspace_graph.io.log import write_log
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.results import read_trajectory
+from pathspace_graph.io.tables import read_trajectory
 
 from ..batch.joint.several import lap
 

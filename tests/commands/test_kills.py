@@ -16,7 +16,8 @@ from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.metrics.measures import Row
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import atomic_file, atomic_folder
-from pathspace_graph.io.log import Log, read_log, write_log
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -44,6 +45,12 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
         truth = replace(log.truth, associations=None) if log.truth else None
         short = replace(log, cycles=log.cycles[:3], truth=truth)
         return Recorded(short, run_estimator("rings", MapperSettings(), short))
+
+
+@pytest.fixture(autouse=True)
+def at_one_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every run writes the same bytes."""
+    monkeypatch.setattr("pathspace_graph.io.results.made", lambda: {"date": "then"})
 
 
 def write_map(recorded: Recorded, out: Path) -> None:

@@ -10,9 +10,9 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.commands.known import read_known_map
-from pathspace_graph.io.log import write_log
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.results import read_trajectory
+from pathspace_graph.io.tables import read_trajectory
 from pathspace_graph.labels import LEFT
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate

@@ -14,10 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from pathspace_graph.cli import main
 from pathspace_graph.convert.twists import with_yaw_rate
-from pathspace_graph.front_end.gate import read_usable_log
-from pathspace_graph.io.log import Detections, Log, read_log
+from pathspace_graph.io.log import Detections, Log
+from pathspace_graph.io.log_files import read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.plausibility.judge import read_usable_log
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.online import LimitSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate

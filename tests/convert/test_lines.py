@@ -15,11 +15,12 @@ from scipy.spatial import KDTree
 from pathspace_graph.cli import main
 from pathspace_graph.convert.lines import DrivenPath, along_lines, are_lines, lines_of, resampled, thinned
 from pathspace_graph.convert.messages import ALONE, DENSE, Points, points_of
-from pathspace_graph.convert.recording import MessageStream
 from pathspace_graph.convert.settings import Frames, LabelRule
 from pathspace_graph.estimators import make_online
-from pathspace_graph.io.log import Log, Odometry, read_log
+from pathspace_graph.io.log import Log, Odometry
+from pathspace_graph.io.log_files import read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
+from pathspace_graph.ros.stream import MessageStream
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import sampled
@@ -132,10 +133,10 @@ def test_polylines_keep_their_labels_and_lose_no_other_points() -> None:
 def test_a_record_is_of_lines_where_nothing_stands_alone_or_where_a_spacing_is_stated() -> None:
     alone, dense = (Points.of([[1.0, 1.0]], [LEFT], lines=line) for line in (ALONE, DENSE))
     empty = Points.of([], [])
-    assert are_lines([dense, empty], None)
-    assert not are_lines([alone, dense], None)
-    assert not are_lines([empty], None)
-    assert are_lines([alone], 0.5)
+    assert are_lines(Points.joined([dense, empty]), None)
+    assert not are_lines(Points.joined([alone, dense]), None)
+    assert not are_lines(empty, None)
+    assert are_lines(alone, 0.5)
 
 
 # --- sides -----------------------------------------------------------------------------------------------
@@ -166,15 +167,15 @@ def test_a_stretch_that_comes_near_later_does_not_decide_a_side() -> None:
 def test_sides_are_those_of_the_way_and_what_is_far_is_left_out() -> None:
     row = np.column_stack([np.arange(0.0, 4.0, 0.5), np.full(8, 1.0)])
     points = np.concatenate([row, row * [1.0, -1.0], [[1.0, 5.0]]])
-    scans = [Points.of(points, np.full(17, UNKNOWN), lines=DENSE)] * 3
+    scan = Points.of(points, np.full(17, UNKNOWN), lines=DENSE)
     notes: Counter[str] = Counter()
-    found = lines_of(np.array([1.0, 2.0, 3.0]), scans, AHEAD, Frames(), 0.5, notes)
-    for one in found:
+    found = lines_of(np.array([1.0, 2.0, 3.0]), Points.joined([scan] * 3), AHEAD, Frames(), 0.5, notes)
+    for one in found.apart(3):
         assert len(one.labels) == 16
         np.testing.assert_array_equal(one.labels == LEFT, one.points[:, 1] > 0.0)
         np.testing.assert_array_equal(one.labels == RIGHT, one.points[:, 1] < 0.0)
     assert notes["points of lines were too far from the driven path, and were left out"] == 3
-    mirrored = lines_of(np.array([1.0]), scans[:1], AHEAD, Frames(y="right"), 0.5, notes)[0]
+    mirrored = lines_of(np.array([1.0]), scan, AHEAD, Frames(y="right"), 0.5, notes)
     np.testing.assert_array_equal(mirrored.labels == RIGHT, mirrored.points[:, 1] > 0.0)
 
 
@@ -184,7 +185,7 @@ def test_of_parallel_markings_the_nearest_ones_bound_the_lane_in_all_their_dashe
 
     lines = [line(0.0, 2.0, 1.7), line(3.0, 5.0, 1.9), line(0.0, 5.0, 5.2), line(0.0, 5.0, -1.8)]
     vertices = Points.of(np.concatenate(lines), np.full(8, UNKNOWN), lines=np.repeat(range(4), 2))
-    found = lines_of(np.array([2.0]), [vertices], AHEAD, Frames(), 1.0, Counter())[0]
+    found = lines_of(np.array([2.0]), vertices, AHEAD, Frames(), 1.0, Counter())
     assert found.points[:, 1].tolist() == [1.7] * 3 + [1.9] * 3 + [-1.8] * 6
     assert found.labels.tolist() == [LEFT] * 6 + [RIGHT] * 6
 
@@ -322,9 +323,9 @@ def test_a_wrong_line_is_named(
 
 
 def test_points_at_the_sensor_itself_have_a_spacing() -> None:
-    scans = [Points.of(np.zeros((3, 2)), np.full(3, UNKNOWN), lines=DENSE)]
-    found = lines_of(np.array([1.0]), scans, AHEAD, Frames(), None, Counter())
-    assert len(found[0].labels) == 1
+    scan = Points.of(np.zeros((3, 2)), np.full(3, UNKNOWN), lines=DENSE)
+    found = lines_of(np.array([1.0]), scan, AHEAD, Frames(), None, Counter())
+    assert len(found.labels) == 1
 
 
 def test_a_column_numbers_the_polylines_of_a_csv_file(

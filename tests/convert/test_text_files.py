@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.io.log import Log, read_log
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.log_files import read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
 

@@ -16,8 +16,9 @@ from pathspace_graph.commands.convert import with_measured_noise
 from pathspace_graph.convert import twists
 from pathspace_graph.convert.recording import strays
 from pathspace_graph.factors.odometry import integrate_poses
-from pathspace_graph.front_end.gate import read_usable_log
-from pathspace_graph.io.log import Log, Odometry, read_log, write_log
+from pathspace_graph.io.log import Log, Odometry
+from pathspace_graph.io.log_files import read_log, write_log
+from pathspace_graph.plausibility.judge import read_usable_log
 from pathspace_graph.settings.online import LimitSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track

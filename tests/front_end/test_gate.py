@@ -16,9 +16,11 @@ from pathspace_graph import ReadingError
 from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.front_end import gate
-from pathspace_graph.front_end.gate import Admitted, Gate, Newest, read_usable_log
-from pathspace_graph.io.log import Detections, Log, Odometry, write_log
+from pathspace_graph.front_end.gate import Admitted, Gate, Newest
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.plausibility.judge import read_usable_log
 from pathspace_graph.settings.online import LimitSettings
 
 from ..scenes.drives import ahead, corridor, exact_log

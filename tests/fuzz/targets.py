@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pathspace_graph.eval.experiment.study import read_study_file
-from pathspace_graph.io.log import read_log
+from pathspace_graph.io.log_files import read_log
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.results import read_trajectory
+from pathspace_graph.io.tables import read_trajectory
 from pathspace_graph.sim.track_files import read_track
 
 SECTION = re.compile(rb"(?:\A|(?<=\n))=== ([a-z_]+\.[a-z]+)\n")
@@ -69,3 +69,6 @@ TARGETS = {
     "track": Target({"track.yaml": "", "track.csv": ""}, read_tracks),
     "study": Target({"study.toml": ""}, lambda folder: read_study_file(folder / "study.toml")),
 }
+INPUTS = sorted(file for file in Path(__file__).with_name("corpus").rglob("*") if file.is_file())
+READ = {"good", "quoted", "splines", "points", "eufs", "tum", "pacsim", "fssim"}
+"""Inputs of the corpus of these names are read, all others are refused."""

@@ -23,7 +23,7 @@ from pathspace_graph.io.export import (
     write_profile,
 )
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
-from pathspace_graph.io.parsing import read_table
+from pathspace_graph.io.tables import read_table
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT
 from pathspace_graph.settings.output import SpeedSettings
 from pathspace_graph.sim.track_files import read_track

@@ -10,7 +10,8 @@ import pytest
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
-from pathspace_graph.io.log import Log, read_log, write_log
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.log_files import read_log, write_log
 
 from .test_log import assert_same, small_log
 

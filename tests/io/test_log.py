@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth, read_log, write_log
+from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.parsing import MAX_HELD, MAX_RANGE
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
@@ -148,124 +149,46 @@ def test_missing_folder(tmp_path: Path) -> None:
         read_log(tmp_path / "absent")
 
 
-BAD_ROWS = [
-    ("odometry.csv", "t,vx,vy,wz\n", 2, "at least one row"),
+HEADER = 'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n'
+ODOMETRY = "t,vx,vy,wz\n"
+DETECTIONS = "t,x,y,label,xx,xy,yy\n"
+BAD_ROWS = [  # what no single cell shows
+    ("odometry.csv", ODOMETRY, 2, "at least one row"),
     ("odometry.csv", "t,vx,vy\n0,1,0\n", 1, "column 'wz'"),
-    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.5,fast,0,0\n", 3, "number in column 'vx', found 'fast'"),
-    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.5,1,nan,0\n", 3, "finite number in column 'vy'"),
-    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.5,1,0,-inf\n", 3, "finite number in column 'wz'"),
-    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1,1,0,0\n1,1,0,0\n", 4, "later than the row before"),
-    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1,1,0,0\n0.5,1,0,0\n", 4, "later than the row before"),
-    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n\n1,1,0\n", 4, "expected 4 fields, found 3"),
-    ("odometry.csv", "t,vx,vy,wz\n0,1,,0\n", 2, "number in column 'vy', found ''"),
     ("odometry.csv", "t,vx,vy,wz,t\n0,1,0,0,0\n", 1, "more than one"),
-    (
-        "odometry.csv",
-        "t,vx,vy,wz\n0,1,0,0\n0.1,1e5,0,0\n",
-        3,
-        "1000 m/s in size in column 'vx', found 100000",
-    ),
-    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n0.1,1,0,-1e9\n", 3, "at most 1000 rad/s in size in column 'wz'"),
-    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1000000000000000000,1,0,0\n", 3, "1e+10 s in size in column 't'"),
-    ("odometry.csv", "t,vx,vy,wz\n0,1,0,0\n1,5,0,0\n1e9,5,0,0\n", 3, "at most 1000 m until the next row"),
-    (
-        "odometry.csv",
-        "t,vx,vy,wz\n" + "".join(f"{k},-999,0,0\n" for k in range(1003)),
-        1003,
-        "at most 1e+06 m",
-    ),
-    ("odometry.csv", "t,vx,vy,wz\n0,1_0,0,0\n", 2, "number in column 'vx', found '1_0'"),
-    ("odometry.csv", "t,vx,vy,wz\n0,\u0661,0,0\n", 2, "number in column 'vx'"),
-    (
-        "detections.csv",
-        "t,x,y,label,xx,xy,yy\n0,3,-1e5,left,1,0,1\n",
-        2,
-        "10000 m in size in column 'y'",
-    ),
-    (
-        "detections.csv",
-        "t,x,y,label,xx,xy,yy\n0,3,1,left,1e9,0,1\n",
-        2,
-        "1e+08 m^2 in size in column 'xx'",
-    ),
-    (
-        "detections.csv",
-        "t,x,y,label,xx,xy,yy\n" + 10001 * "0,3,1,left,1,0,1\n",
-        2,
-        "10000 detections",
-    ),
-    ("truth_poses.csv", "t,x,y,theta\n0,1e9,0,0\n", 2, "at most 1e+08 m in size in column 'x'"),
+    ("odometry.csv", f"{ODOMETRY}0,1,0,0\n\n1,1,0\n", 4, "expected 4 fields, found 3"),
+    ("truth_cones.csv", "x,y,label\n0,1,left\n\n0,2\n", 4, "expected 3 fields, found 2"),
+    ("odometry.csv", f"{ODOMETRY}0,1,0,0\n1,1,0,0,7\n", 3, "expected 4 fields, found more"),
+    ("odometry.csv", f"{ODOMETRY}0,1,0,0\n1,1,0,0,7,8\n", 3, "expected 4 fields, found 6"),
+    ("odometry.csv", f"{ODOMETRY}0,1,0,0\n1,1,0,0\n1,1,0,0\n", 4, "later than the row before"),
+    ("odometry.csv", f"{ODOMETRY}0,1,0,0\n1,5,0,0\n1e9,5,0,0\n", 3, "at most 1000 m until the next row"),
+    ("odometry.csv", ODOMETRY + "".join(f"{k},-999,0,0\n" for k in range(1003)), 1003, "at most 1e+06 m"),
+    ("odometry.csv", f"{ODOMETRY}0,1,0,0\n0.1,1e5,0,0\n", 3, "1000 m/s in size in column 'vx', found 100000"),
+    ("detections.csv", f"{DETECTIONS}0,3,-1e5,left,1,0,1\n", 2, "10000 m in size in column 'y'"),
+    ("detections.csv", f"{DETECTIONS}0,3,1,left,1e9,0,1\n", 2, "1e+08 m^2 in size in column 'xx'"),
+    ("detections.csv", DETECTIONS + 10001 * "0,3,1,left,1,0,1\n", 2, "10000 detections"),
+    ("detections.csv", f"{DETECTIONS}0.2,3,1,left,1,0,1\n0.1,3,1,left,1,0,1\n", 3, "not earlier"),
+    ("detections.csv", f"{DETECTIONS}0,3,1,left,1,0,1\n0,3,1,left,1,2,1\n", 3, "positive definite"),
+    ("detections.csv", f"{DETECTIONS}0,3,1,left,1,1,1\n", 2, "positive definite"),
+    ("detections.csv", f"{DETECTIONS}-0.1,3,1,left,1,0,1\n", 2, "before the first odometry"),
+    ("detections.csv", f"{DETECTIONS}0,3,1,left,1,0,1\n1.6,3,1,left,1,0,1\n", 3, "after the last"),
     ("truth_poses.csv", "t,x,y,theta\n0,0,0,1e9\n", 2, "at most 1e+06 rad in size in column 'theta'"),
-    ("truth_cones.csv", "x,y,label\n0,9.2e18,left\n", 2, "at most 1e+08 m in size in column 'y'"),
-    ("detections.csv", "t,x,y,label,xx,xy\n", 1, "column 'yy'"),
-    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,?,1,left,1,0,1\n", 2, "number in column 'x'"),
-    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,1,0,1\n0,3,inf,left,1,0,1\n", 3, "finite"),
-    ("detections.csv", "t,x,y,label,xx,xy,yy\n0.2,3,1,left,1,0,1\n0.1,3,1,left,1,0,1\n", 3, "not earlier"),
-    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,1,0,1\n0,3,1,left,1,2,1\n", 3, "positive definite"),
-    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,1,1,1\n", 2, "positive definite"),
-    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,-1,0,-1\n", 2, "positive definite"),
-    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,0,0,0\n", 2, "positive definite"),
-    ("detections.csv", "t,x,y,label,xx,xy,yy\n-0.1,3,1,left,1,0,1\n", 2, "before the first odometry"),
-    ("detections.csv", "t,x,y,label,xx,xy,yy\n0,3,1,left,1,0,1\n1.6,3,1,left,1,0,1\n", 3, "after the last"),
     ("truth_poses.csv", "t,x,y,theta\n0,0,0,0\n0,0,0,0\n", 3, "later than the row before"),
-    ("truth_cones.csv", "x,y,label\n0,word,left\n", 2, "number in column 'y'"),
+    ("truth_cones.csv", "x,y,label\n0,9.2e18,left\n", 2, "at most 1e+08 m in size in column 'y'"),
     ("truth_associations.csv", "cone\n-1\n0\n", 3, "-1 or the index"),
     ("truth_associations.csv", "cone\n-1\n-1.5\n", 3, "-1 or the index"),
     ("truth_associations.csv", "cone\n-1\n", None, "each of 2 detections"),
-    ("log.toml", 'format = "pathspace-log/1"\n[odometry]\nsigma = [\n', None, "expected TOML"),
     ("log.toml", 'format = "pathspace-log/1"\n[odometry\n', 2, "expected TOML"),
-    ("log.toml", 'format = "pathspace-log/2"\n[odometry]\nsigma = [1, 1, 1]\n', None, "pathspace-log/1"),
-    ("log.toml", 'format = "pathspace-log/1"\n[sensor]\nfov = 1\n', None, "odometry: expected, but missing"),
-    ("log.toml", 'format = "pathspace-log/1"\nodometry = 3\n', None, "odometry: expected object, got int"),
-    (
-        "log.toml",
-        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n[truth]\nscale = 0.1\n',
-        None,
-        "truth.bias: expected, but missing",
-    ),
-    (
-        "log.toml",
-        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n[truth]\nscale = 0\nbias = 0\nyaw = 1\n',
-        None,
-        "truth.lateral: expected, but missing",
-    ),
-    (
-        "log.toml",
-        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1]\n',
-        None,
-        "odometry.sigma: expected array of length 3",
-    ),
-    (
-        "log.toml",
-        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 0, 1]\n',
-        None,
-        "odometry.sigma[1]: expected float > 0.0",
-    ),
-    (
-        "log.toml",
-        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, nan, 1]\n',
-        None,
-        "odometry.sigma[1]: expected float",
-    ),
-    (
-        "log.toml",
-        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, "a", true]\n',
-        None,
-        "odometry.sigma[1]: expected float, got str",
-    ),
-    (
-        "log.toml",
-        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n[sensor]\nfov = "wide"\n',
-        None,
-        "fov",
-    ),
-    (
-        "log.toml",
-        'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n[sensor]\nkind = "wall"\n',
-        None,
-        "sensor.kind: expected one of cones|line",
-    ),
-]
+    ("log.toml", HEADER.replace("/1", "/2"), None, "pathspace-log/1"),
+    ("log.toml", HEADER.replace("[odometry]", "[sensor]"), None, "odometry: expected, but missing"),
+    ("log.toml", HEADER.replace("1, 1, 1", "1, 1"), None, "odometry.sigma: expected array of length 3"),
+    ("log.toml", HEADER.replace("1, 1, 1", "1, 0, 1"), None, "odometry.sigma[1]: expected float > 0.0"),
+    ("log.toml", HEADER.replace("1, 1, 1", "1, nan, 1"), None, "odometry.sigma[1]: expected float"),
+    ("log.toml", HEADER.replace("1, 1, 1", '1, "a", 1'), None, "odometry.sigma[1]: expected float, got str"),
+    ("log.toml", f"{HEADER}[truth]\nscale = 0.1\n", None, "truth.bias: expected, but missing"),
+    ("log.toml", f"{HEADER}[truth]\nscale = 0\nbias = 0\nyaw = 1\n", None, "truth.lateral: expected, but"),
+    ("log.toml", f'{HEADER}[sensor]\nkind = "wall"\n', None, "sensor.kind: expected one of cones|line"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "text", "row", "message"), BAD_ROWS)

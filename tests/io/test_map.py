@@ -24,7 +24,6 @@ from pathspace_graph.io.map import (
     map_to_json,
     read_map,
 )
-from pathspace_graph.io.moved import moved
 from pathspace_graph.labels import LEFT, ORANGE, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import fit_spline
@@ -230,7 +229,7 @@ def _change_first(path: str, value: Any) -> Change:
         (_set("boundaries.left.knots", [0.0, 1.0]), "boundaries.left"),
         (_change_first("boundaries.left.knots", 1e9), "boundaries.left"),
         (_change_first("boundaries.left.knots", "x"), "boundaries.left.knots"),
-        (_change_first("boundaries.left.knots", float("nan")), "boundaries.left.knots"),
+        (_change_first("boundaries.left.knots", float("nan")), "row 1: expected JSON"),
         (_set("boundaries.left.control_points", []), "boundaries.left"),
         (_set("boundaries.left.control_points", {}), "boundaries.left.control_points"),
         (_change_first("boundaries.left.control_points", [1.0]), "boundaries.left.control_points"),
@@ -292,7 +291,7 @@ def test_points_and_covariances_turn_with_the_frame() -> None:
     line = fit_spline(np.column_stack([np.arange(8.0), np.zeros(8)]), 5, False)
     boundaries = {LEFT: SplineBoundary(line, np.eye(10)), RIGHT: PointBoundary(points, joint)}
     cones = {ORANGE: PointBoundary(points, joint)}
-    found = moved(Map(False, boundaries, np.eye(14), cones), QUARTER)
+    found = Map(False, boundaries, np.eye(14), cones).moved(QUARTER)
     right = found.boundaries[RIGHT]
     assert isinstance(right, PointBoundary)
     for own in (right, found.points[ORANGE]):

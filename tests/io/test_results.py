@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.map import Map, PointBoundary
-from pathspace_graph.io.results import (
-    SMOOTHED_FILE,
-    CycleRecord,
-    RunResult,
-    read_trajectory,
-    write_result,
-)
+from pathspace_graph.io.results import SMOOTHED_FILE, CycleRecord, RunResult, write_result
+from pathspace_graph.io.tables import read_trajectory
 from pathspace_graph.labels import LEFT
 
 
@@ -55,7 +51,10 @@ def test_the_folder_holds_the_four_files_of_the_contract(tmp_path: Path) -> None
     assert rows[1:] == ["0,0.1,0.001,0,4,7,1,0,,,0", "1,0.2,0.002,9,7,12,2,15,lost,no way,0"]
     assert read_cycles(tmp_path / "map")["health"].tolist() == ["", "lost"]
     read = json.loads((tmp_path / "map" / "summary.json").read_text())
+    made = read.pop("made")
     assert read == {"estimator": "fixed-lag", "ate": None, "laps": [{"lap": 1, "rmse": 0.5}]}
+    assert made["commit"] and made["machine"]
+    assert abs((datetime.fromisoformat(made["date"]) - datetime.now(UTC)).total_seconds()) < 600.0
 
 
 def test_a_smoothed_trajectory_has_a_file_of_its_own(tmp_path: Path) -> None:

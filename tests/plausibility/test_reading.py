@@ -12,7 +12,8 @@ import pytest
 from pathspace_graph import hints
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.log import Log, Odometry, write_log
+from pathspace_graph.io.log import Log, Odometry
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.plausibility.judge import read_plausible_log, refused_hints
 from pathspace_graph.settings.online import LimitSettings
 from pathspace_graph.sim.mistakes import MISTAKES

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.io.log import Detections, Log, Odometry, write_log
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.io.results import BatchRun
 from pathspace_graph.labels import LEFT, RIGHT

@@ -10,7 +10,8 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.log import Log, read_log
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.log_files import read_log
 from pathspace_graph.sim.sensor import ConeSensor, OdometryNoise, SensorSettings, measure_twists
 from pathspace_graph.sim.simulate import CAMERA, CAMERA_FAULTS, INS, SimulationSettings, preset, simulate
 

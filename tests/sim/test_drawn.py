@@ -11,7 +11,8 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.log import Log, read_log, write_log
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.sim.cameras import CAMERA, INS, DrawnCar, draw_car
 from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults
 from pathspace_graph.sim.sensor import ConeSensor, OdometryNoise, SensorSettings

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.log import Log, Truth, read_log, write_log
+from pathspace_graph.io.log import Log, Truth
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings

@@ -11,7 +11,8 @@ from scipy import stats
 
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.io.log import Log, read_log, write_log
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.sim.lines import LINE, BoundaryCurve, LineSensor, LineSettings, as_lines
 from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate

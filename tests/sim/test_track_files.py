@@ -243,7 +243,7 @@ def test_bad_pacsim(tmp_path: Path, replaced: dict[str, str], message: str) -> N
 BAD_CSV = [
     (straight_eufs("blue,word,0,0,,,\n"), 17, "number in column 'x'"),
     (straight_eufs("blue,nan,0,0,,,\n"), 17, "finite number in column 'x'"),
-    (straight_eufs("blue,1\n"), 17, "expected 7 fields"),
+    (straight_eufs("blue,1\n"), 17, "expected 7 fields, found 2"),
     ("tag,x,direction\nblue,0,0\n", 1, "column 'y'"),
     ("tag,x,y\nblue,0,0\nblue,1,0\nyellow,1,3\n", None, "at least 3 blue cones"),
     (straight_eufs().replace("car_start,-6,0,0", "car_start,-6,0,north"), 2, "heading of car_start"),

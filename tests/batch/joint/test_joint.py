@@ -22,7 +22,6 @@ from pathspace_graph.eval.metrics.trajectory import position_rms, trajectory_err
 from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.moved import moved_run
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .several import alone, lap, together, true_start
@@ -105,7 +104,7 @@ def test_the_map_is_better_than_those_of_the_drives_alone() -> None:
     assert track.closed
     assert shape_rmse(track, truth_of(lap(0))) < 0.9 * np.mean(shapes)
     for name, log in logs.items():
-        own = moved_run(result.drives[name], inverse(result.frames[name]))
+        own = result.drives[name].moved(inverse(result.frames[name]))
         metrics = lap_metrics(own.map, truth_of(log), 1)
         assert metrics.missed == 0.0 and metrics.rmse < 0.25
         assert position_rms(trajectory_errors(own.trajectory_t, own.trajectory, truth_of(log))) < 0.35

@@ -21,7 +21,7 @@ from pathspace_graph.eval.experiment.compare import (
 )
 from pathspace_graph.eval.experiment.plots import Drawn, plot_maps
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
-from pathspace_graph.io.log import read_log, write_log
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ...scenes.rings import Gaps, Rings, register, write_logs

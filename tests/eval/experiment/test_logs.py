@@ -12,7 +12,7 @@ from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval.experiment.run import make_plan, run_study
 from pathspace_graph.eval.experiment.study import Study, read_study_file, study_from
 from pathspace_graph.eval.experiment.tables import Quantity, results_table, write_study
-from pathspace_graph.io.log import read_log, write_log
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.map import read_map
 
 from ...scenes.paths import ROOT

@@ -22,7 +22,7 @@ from pathspace_graph.eval.experiment import provenance
 from pathspace_graph.eval.experiment.provenance import code_of, made
 from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.study import Study, read_study_file
-from pathspace_graph.io.log import write_log
+from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import PointBoundary, read_map
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.run import split_odometry

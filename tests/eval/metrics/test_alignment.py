@@ -11,7 +11,6 @@ from pathspace_graph.eval.metrics.alignment import aligned_distance, maps_apart,
 from pathspace_graph.factors.se2 import inverse, move_points, wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import NO_COVARIANCE, Map, PointBoundary, SplineBoundary
-from pathspace_graph.io.moved import moved
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.knots import fit_spline
 
@@ -44,7 +43,7 @@ def points(cones: dict[int, Array]) -> Map:
 @pytest.mark.parametrize("kind", [curves, points])
 def test_a_map_lies_on_itself_wherever_its_drive_began(kind: type) -> None:
     track = kind(rows())
-    apart = maps_apart(moved(points(rows()) if kind is points else track, AWAY), track)
+    apart = maps_apart((points(rows()) if kind is points else track).moved(AWAY), track)
     assert apart.mean < 1e-3
     off = apart.motion - inverse(AWAY)
     assert np.hypot(*off[:2]) < 0.01

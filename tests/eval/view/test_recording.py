@@ -12,7 +12,7 @@ from pathspace_graph.cli import main
 from pathspace_graph.errors import OutputError, SettingsError
 from pathspace_graph.eval.view import recording as module
 from pathspace_graph.eval.view.recording import DISPLAYS, check_recording, has_display, recording
-from pathspace_graph.io.log import write_log
+from pathspace_graph.io.log_files import write_log
 
 from ...scenes.drives import ahead, corridor, exact_log
 
