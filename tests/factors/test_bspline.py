@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline as ScipyBSpline
 
@@ -102,7 +102,6 @@ def test_a_repeated_end_knot_of_an_unclamped_spline_belongs_to_the_last_span_tha
     assert matrix.sum() == pytest.approx(1.0)
 
 
-@settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), degree=st.integers(1, 5), kind=st.sampled_from(KINDS))
 def test_partition_of_unity_locality_and_spans(seed: int, degree: int, kind: str) -> None:
     rng = np.random.default_rng(seed)

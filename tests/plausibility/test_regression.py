@@ -95,7 +95,7 @@ def moved(fit: Fit, odometry: Odometry = ODOMETRY, noise: float = 0.0) -> Regres
     return Regression(odometry, replace(empty, velocity=v, rate=w))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.floats(0.01, 50.0),
     st.floats(-3.1, 3.1),
