@@ -71,6 +71,17 @@ def test_colours_are_swapped_by_a_clear_majority(agreeing: int, opposing: int, s
     assert is_swapped(judge, 0, agreeing, opposing) is swapped
 
 
+def test_a_cone_that_was_first_seen_out_of_reach_votes_later() -> None:
+    """Three cones of the other side's colour are 10 m ahead, beyond the reach, and 5 m ahead a second on."""
+    judge, points = SideJudge(SidesSettings()), np.array([[10.0, 2.0], [10.0, -2.0], [11.5, 2.0]])
+    labels = np.where(points[:, 1] > 0.0, RIGHT, LEFT)
+    for k, x in enumerate((0.0, 5.0)):
+        judge.update(
+            np.array([x, 0.0, 0.0]), np.array([[5.0, 0.0, 0.0]]), detections(k, points - [x, 0.0], labels)
+        )
+        assert judge.swapped is (k == 1)
+
+
 @pytest.mark.parametrize(("agreeing", "swapped"), [(7, True), (8, False)])
 def test_colours_are_swapped_back_by_as_clear_a_majority(agreeing: int, swapped: bool) -> None:
     """Three cones were on the other side."""

@@ -110,6 +110,18 @@ def test_what_is_expected_counts_until_odometry_has_failed() -> None:
         assert laid.odds == pytest.approx(NEW_ROAD - cost, abs=1e-3)
 
 
+@pytest.mark.parametrize("away", [(3.6, 0.0, 0.0), (-2.4, 2.6, 0.2)])
+def test_a_place_far_from_where_it_is_expected_is_found_among_many_cones(
+    away: tuple[float, float, float],
+) -> None:
+    """Wrong places near the mean have votes too, but the distance counts only until odometry has failed."""
+    known = scattered(60)
+    sure = np.diag(np.array([0.01, 0.01, 0.001]) ** -2.0)
+    laid = lay(beside(known, slice(30)), known, POSE + np.array(away), sure, REACH)
+    assert laid is not None and laid.is_sure
+    np.testing.assert_allclose(laid.pose, POSE, atol=1e-3)
+
+
 def test_the_heading_may_have_turned_around() -> None:
     known = scattered()
     mean = POSE + np.array([0.4, 0.4, 2.0 * np.pi])

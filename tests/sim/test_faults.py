@@ -11,11 +11,11 @@ import pytest
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Log, Truth, read_log, write_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults
+from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults, measure_odometry
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
-from pathspace_graph.sim.vehicle import VehicleSettings
+from pathspace_graph.sim.vehicle import Drive, VehicleSettings
 
 from ..scenes.drives import bean_track
 
@@ -198,6 +198,18 @@ def test_a_yaw_rate_bias_is_added_and_is_part_of_the_true_calibration(clean: Log
     assert found is not None and expected is not None
     np.testing.assert_allclose(found - expected, [0.0, 0.02], atol=1e-15)
     assert same_cycles(faulty, clean)
+
+
+def test_a_fault_scales_what_the_wheels_turn_and_not_the_drawn_errors() -> None:
+    """`wheels (1 + drawn + fault)`: the product of both scales is in no reading."""
+    t = 0.02 * np.arange(50)
+    twists = np.column_stack([5.0 + np.sin(t), 0.1 * np.cos(t), 0.3 * np.sin(2.0 * t)])
+    driven, rng = Drive(t, np.zeros((50, 3)), twists), np.random.default_rng(1)
+    noise = OdometryNoise(white=(1e-12, 1e-12, 1e-12), scale=0.1, gyro_bias=0.0)
+    found, calibration = measure_odometry(driven, 1.0, noise, OdometryFaults(speed_scale=0.05), rng)
+    assert abs(calibration[0] - 0.05) > 0.01
+    np.testing.assert_allclose(found.twist[:, :2], (1.0 + calibration[0]) * twists[:, :2], atol=1e-9)
+    np.testing.assert_allclose(found.twist[:, 2], twists[:, 2], atol=1e-9)
 
 
 def test_slipping_wheels_measure_too_much_for_1_s_every_8_s() -> None:

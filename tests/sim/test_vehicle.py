@@ -6,14 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
 from scipy.spatial import cKDTree
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.laps import lap_end_indices
+from pathspace_graph.sim.curves import CentreLine, left_normals
 from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import generate_track
-from pathspace_graph.sim.vehicle import Drive, VehicleSettings, drive, integrate
+from pathspace_graph.sim.vehicle import Drive, VehicleSettings, _settling, drive, integrate
 
 
 def generated(seed: int) -> Track:
@@ -133,6 +135,20 @@ def test_open_track_is_driven_once_from_an_odd_start_pose() -> None:
     end = np.array([[cos, -sin], [sin, cos]]) @ d.poses[-1, :2] + [0.0, 0.3]
     assert end[0] == pytest.approx(60.0, abs=1.0)
     assert abs(end[1]) < 0.05
+
+
+def test_a_start_beside_a_bend_begins_in_its_own_direction() -> None:
+    """2 m inside a circle of 10 m, a metre of the middle line is 0.8 m of the path beside it."""
+    at = np.linspace(0.0, 20.0 * np.pi, 401)
+    circle = 10.0 * np.column_stack([np.cos(at / 10.0), np.sin(at / 10.0)])
+    circle[-1] = circle[0]
+    line = CentreLine(CubicSpline(at, circle, bc_type="periodic"), at[-1], True, np.full(401, 2.0))
+    pose = line.points(np.array([0.0]))[0] + 2.0 * left_normals(line.tangents(np.array([0.0])))[0]
+    heading = np.arctan2(*line.tangents(np.array([0.0]))[0][::-1]) + 0.3
+    s = np.array([0.0, 1e-4])
+    offset = _settling(line, 0.0, np.append(pose, heading), s, VehicleSettings())
+    path = line.points(s) + left_normals(line.tangents(s)) * offset[:, None]
+    assert np.arctan2(*np.diff(path, axis=0)[0][::-1]) == pytest.approx(heading, abs=1e-3)
 
 
 def test_start_speed() -> None:
