@@ -22,7 +22,6 @@ from pathspace_graph.settings.mapper import Knots, MapperSettings, SplineSetting
 from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import relocate
 
-from ..oracles.copied import copied
 from ..scenes.drives import (
     ODOMETRY_SIGMA,
     ahead,
@@ -35,6 +34,7 @@ from ..scenes.drives import (
     replay,
     true_poses,
 )
+from ..shared.copied import copied
 
 Array = NDArray[np.float64]
 

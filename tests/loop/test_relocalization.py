@@ -29,9 +29,9 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, OpenLapSettings
 
-from ..oracles.copied import copied
 from ..scenes.drives import ODOMETRY_SIGMA, Mapped, detections, map_beginning, map_log, replay, true_poses
 from ..scenes.kidnapped import laps_log, pear_track, put_down
+from ..shared.copied import copied
 
 Array = NDArray[np.float64]
 

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import compose, left_of, path_lengths, relative, rotation, to_map, to_vehicle
 from pathspace_graph.io.log import Detections
@@ -37,6 +38,7 @@ from pathspace_graph.mapping.tentative import TentativeTracks, merged_in_turn
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import path_of
+from . import laid_in_numpy
 
 SETTINGS = MapperSettings()
 GROWTH = SETTINGS.growth
@@ -146,6 +148,33 @@ def test_the_information_is_that_of_repeated_observations() -> None:
             off = laid.pose - POSE
             squares.append(off @ laid.information @ off / 3.0)
         assert least < np.mean(squares) < most
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_compiled_places_are_those_in_numpy(seed: int) -> None:
+    """Cones of two colours, the same with noise from a pose, views of them, and what is expected of it."""
+    rng = np.random.default_rng(seed)
+
+    def spread(size: int, count: int = 1) -> Array:
+        roots = rng.normal(size=(count, size, size))
+        return roots @ roots.transpose(0, 2, 1)
+
+    points, labels, pose = rng.uniform(-12.0, 12.0, (17, 2)), rng.integers(0, 2, 17), POSE * [10.0, 10.0, 2.0]
+    seen = to_vehicle(points + pose[:2], pose[None]) + 0.1 * rng.normal(size=(17, 2))
+    views = np.column_stack(
+        [pose + rng.normal(size=(3, 3)), rng.uniform(5.0, 15.0, 3), rng.uniform(0.3, 2.0, 3)]
+    )
+    arguments = (
+        (seen, 0.01 * spread(2, 17), labels),
+        (points + pose[:2], 0.01 * spread(2, 17), labels),
+        views,
+        pose + np.array([0.7, -0.4, 0.1]),
+        0.1 * (spread(3)[0] + np.eye(3)),
+        REACH,
+        (0.25, 9.0, 0.5, 0.05, 1.0, 10.0, 2.0, 20.0),
+    )
+    for found, expected in zip(kernels.laid(*arguments), laid_in_numpy.laid(*arguments), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * max(1.0, np.abs(expected).max()))
 
 
 # --- how sure it is --------------------------------------------------------------------------------------
