@@ -257,6 +257,27 @@ def test_a_start_below_the_dead_band_is_missed_and_nothing_else() -> None:
     assert way == pytest.approx(0.375, abs=0.05)
 
 
+def test_a_slow_start_is_missed_only_after_a_standstill() -> None:
+    """A log may begin on a vehicle that creeps, whose odometry has not stood."""
+    t = 0.02 * np.arange(6)
+    for first in (0.4, 0.0):
+        twists = np.array([first, 0.5, 0.8, 1.2, 0.7, 0.6])[:, None] * [1.0, 0.0, 0.0]
+        noise = OdometryNoise(white=(1e-12, 1e-12, 1e-12), scale=0.0, gyro_bias=0.0)
+        driven, rng = Drive(t, np.zeros((6, 3)), twists), np.random.default_rng(1)
+        found, _ = measure_odometry(driven, 1.0, noise, OdometryFaults(dead_band=1.0), rng)
+        missed = [0.0] * 3 + [1.2, 0.7, 0.6] if first == 0.0 else twists[:, 0]
+        np.testing.assert_allclose(found.twist[:, 0], missed, atol=1e-9)
+
+
+def test_false_travel_goes_on_for_its_time_while_the_vehicle_stands() -> None:
+    t = 0.02 * np.arange(7)
+    twists = np.array([2.0, 1.0, 0.3, 0.0, 0.0, 0.0, 0.0])[:, None] * [1.0, 0.0, 0.0]
+    noise = OdometryNoise(white=(1e-12, 1e-12, 1e-12), scale=0.0, gyro_bias=0.0)
+    faults, rng = OdometryFaults(false_travel=0.5, false_travel_time=0.04), np.random.default_rng(1)
+    found, _ = measure_odometry(Drive(t, np.zeros((7, 3)), twists), 1.0, noise, faults, rng)
+    np.testing.assert_allclose(found.twist[:, 0], [2.0, 1.0, 0.5, 0.5, 0.5, 0.0, 0.0], atol=1e-9)
+
+
 def test_a_log_that_begins_with_a_gap_still_has_its_first_stamp() -> None:
     odometry = drive(LAPS, odometry=OdometryFaults(gap=1.0, gap_at=0.0)).odometry
     assert odometry.t[0] == 0.0
