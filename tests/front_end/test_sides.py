@@ -134,6 +134,13 @@ def test_colours_count_again_once_most_of_the_newest_detections_have_one() -> No
     assert said[0] and said.index(False) == 400 + 17
 
 
+@pytest.mark.parametrize(("count", "colourless"), [(5, False), (6, True)])
+def test_a_few_detections_do_not_tell_that_a_log_has_no_colours(count: int, colourless: bool) -> None:
+    judge = SideJudge(SidesSettings())
+    judge.update(np.zeros(3), np.zeros((1, 3)), detections(0.0, PLACES[:count], np.full(count, UNKNOWN)))
+    assert judge.colourless is colourless
+
+
 def test_where_colours_are_common_an_unknown_one_stays_unknown() -> None:
     """The large cones of a start line have no colour, and stand beside the boundary."""
     log = drive(Faults(sensor=SensorFaults(colourless=0.4)))
