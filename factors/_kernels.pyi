@@ -1,4 +1,4 @@
-"""Compiled functions of arrays (`kernels/`); `tests/oracles` has each in numpy, to which tests hold it.
+"""Compiled functions of arrays (`kernels/`).
 
 Arrays of shapes that don't fit each other raise ValueError. Limits are tuples, in the order that is told.
 """

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -22,6 +23,9 @@ from pathspace_graph.run import CycleResult
 
 from .shared import laps
 from .shared.session import FOLDER
+
+settings.register_profile("tests", deadline=None, max_examples=60)  # on top of hypothesis' own one in CI
+settings.load_profile("tests")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -25,11 +25,11 @@ from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
 
-from .oracles.copied import copied
 from .scenes.digest import digest
 from .scenes.drives import beginning, map_beginning, mapped, noisy_lap, replay
 from .scenes.holes import unseen
 from .scenes.kidnapped import laps_log, pear_track, put_down
+from .shared.copied import copied
 
 EVERY = 23
 """Cycles from one pair of copies to the next: no multiple of the periods at which things are done."""

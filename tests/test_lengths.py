@@ -81,7 +81,7 @@ def test_each_number_changes_by_its_own_power() -> None:
     np.testing.assert_allclose(state.covariance[2:, 2:], 1.0)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.floats(0.01, 100.0))
 def test_there_and_back_is_the_same_log(factor: float) -> None:
     log = short_drive()

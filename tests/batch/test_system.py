@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.association import associate, locate_poses
@@ -158,3 +160,27 @@ def test_beyond_the_gate_the_loss_is_constant() -> None:
     np.testing.assert_allclose(KERNEL.loss(np.array([4.0, 5.0, 50.0])), KERNEL.gate**2 / 6.0)
     np.testing.assert_array_equal(KERNEL.weights(np.array([-4.0, 4.0, 50.0])), 0.0)
     assert KERNEL.weights(np.array([3.99]))[0] < 1e-4
+
+
+def test_a_detection_that_is_not_in_use_costs_as_much_as_one_at_the_gate() -> None:
+    system, state = small_system()
+    used, before = system.detections.used.copy(), system.evaluate(state)
+    row = before.across.rows[before.across.whitened.argmin()]
+    loss = float(system.kernel.loss(before.across.whitened[before.across.rows == row])[0])
+    system.detections.release(np.array([row]))
+    after = system.evaluate(state).cost
+    system.detections.used[:] = used
+    assert after - before.cost == pytest.approx(system.kernel.gate**2 / 6.0 - loss, rel=1e-6)
+
+
+def test_wider_priors_hold_the_calibration_of_the_odometry_less() -> None:
+    """Their rows are `b / sigma`, with the sigmas of the other settings."""
+    system, state = small_system()
+    before, settings, priors = system.chain, system.settings, [*system.priors]
+    odometry = replace(settings.odometry, sigma_scale=0.5, sigma_bias=0.25)
+    system.widen_priors(0, replace(settings, odometry=odometry))
+    (key,) = state.variables.calibration_keys[:1]
+    rows = [one for one in system.drive_rows(state) if one.keys.shape[1] == 1 and (one.keys == key).all()]
+    system.chain, system.settings, system.priors = before, settings, priors
+    (prior,) = rows
+    np.testing.assert_allclose(prior.jacobian, np.diag([2.0, 4.0]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.interpolate import BSpline as ScipyBSpline
 
@@ -20,9 +20,6 @@ from pathspace_graph.factors.bspline import (
 )
 from pathspace_graph.factors.footpoint import SEARCH_ITERATIONS, FootPoints, foot_points
 from pathspace_graph.spline.bspline import end_change_matrix
-
-from ..oracles.footpoint import Stretch, curve_coefficients, stretch_of
-from ..oracles.spans import Spans, lay_out
 
 TOLERANCE = 1e-12
 KINDS = ("random", "repeated", "clamped", "uniform")
@@ -102,7 +99,6 @@ def test_a_repeated_end_knot_of_an_unclamped_spline_belongs_to_the_last_span_tha
     assert matrix.sum() == pytest.approx(1.0)
 
 
-@settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), degree=st.integers(1, 5), kind=st.sampled_from(KINDS))
 def test_partition_of_unity_locality_and_spans(seed: int, degree: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
@@ -151,20 +147,6 @@ def test_wrapped_parameters_stay_inside_the_domain() -> None:
     inside = SpanPolynomials(knots, 3, periodic=True).inside(u)
     assert ((inside >= low) & (inside <= high)).all()
     assert inside[1] == pytest.approx(low)
-
-
-def test_curve_coefficients_give_the_curve() -> None:
-    rng = np.random.default_rng(8)
-    knots = make_knots("clamped", 3, rng)
-    points = rng.normal(size=(len(knots) - 4, 2))
-    tables = SpanPolynomials(knots, 3)
-    u = rng.uniform(tables.low, tables.high, 30)
-    number, s = tables.locate(u)
-    terms = curve_coefficients(lay_out([tables], [0]), points)[..., number]
-    curve = np.einsum("krdm,mk->rmd", terms, s[:, None] ** np.arange(4))
-    for order in range(3):
-        expected = ScipyBSpline(knots, points, 3)(u, nu=order)
-        assert relative_error(curve[order], expected) < TOLERANCE
 
 
 def test_cubic_values_in_the_middle_of_uniform_knots_are_the_textbook_ones() -> None:
@@ -265,77 +247,3 @@ def test_an_extended_curve_is_that_of_all_its_knots() -> None:
     np.testing.assert_array_equal(extended.coefficients, whole.coefficients)
     u = np.linspace(whole.low, whole.high, 40)
     np.testing.assert_array_equal(extended.evaluate(u, 2)[0], whole.evaluate(u, 2)[0])
-
-
-# --- stretches -------------------------------------------------------------------------------------------
-
-OPEN = SpanPolynomials(uniform_knots(13, 3), 3)
-"""An open curve with the domain [0, 10] and knots one apart."""
-CLOSED = SpanPolynomials(periodic_knots(np.linspace(0.0, 8.0, 5), 3), 3, True)
-"""A closed curve with the domain [0, 8] and knots two apart."""
-OPEN_ALONE, CLOSED_ALONE = lay_out([OPEN], [0]), lay_out([CLOSED], [0])
-
-
-def stretches(spans: Spans, limits: list[tuple[float, float]], curve: IntArray | None = None) -> Stretch:
-    """Returns the stretches with these limits, all on the first curve where none is given."""
-    low, high = np.array(limits).T
-    return stretch_of(spans, np.zeros(len(limits), np.intp) if curve is None else curve, low, high)
-
-
-def assert_limits(stretch: Stretch, low: list[float], high: list[float]) -> None:
-    np.testing.assert_allclose(stretch.low, low, atol=1e-12)
-    np.testing.assert_allclose(stretch.high, high, atol=1e-12)
-
-
-def test_on_an_open_curve_limits_are_clipped_to_the_domain() -> None:
-    stretch = stretches(OPEN_ALONE, [(2.0, 4.0), (-3.0, 1.0), (9.0, 30.0), (12.0, 15.0)])
-    assert_limits(stretch, [2.0, 0.0, 9.0, 10.0], [4.0, 1.0, 10.0, 10.0])
-    np.testing.assert_array_equal(stretch.length, 10.0)
-    np.testing.assert_array_equal(stretch.interval, 1.0)
-
-
-def test_reversed_limits_give_a_stretch_of_no_length() -> None:
-    assert_limits(stretches(OPEN_ALONE, [(5.0, 3.0)]), [5.0], [5.0])
-    assert_limits(stretches(CLOSED_ALONE, [(5.0, 3.0)]), [5.0], [5.0])
-
-
-def test_around_a_closed_curve_a_stretch_begins_in_the_domain_and_may_end_beyond_the_seam() -> None:
-    stretch = stretches(CLOSED_ALONE, [(1.0, 3.0), (7.0, 9.5), (-1.0, 1.0), (17.0, 18.0)])
-    assert_limits(stretch, [1.0, 7.0, 7.0, 1.0], [3.0, 9.5, 9.0, 2.0])
-
-
-def test_a_stretch_of_a_period_is_the_whole_curve_and_has_no_limits() -> None:
-    stretch = stretches(CLOSED_ALONE, [(3.0, 11.0), (3.0, 5.0), (-100.0, 100.0)])
-    assert_limits(stretch, [0.0, 3.0, 0.0], [8.0, 5.0, 8.0])
-    np.testing.assert_array_equal(stretch.floor, [-np.inf, 3.0, -np.inf])
-    np.testing.assert_array_equal(stretch.ceiling, [np.inf, 5.0, np.inf])
-    np.testing.assert_array_equal(stretch.within(np.array([-50.0, 9.0, 50.0])), [-50.0, 5.0, 50.0])
-
-
-def test_a_start_is_moved_to_the_nearest_limit_of_an_open_curve() -> None:
-    stretch = stretches(OPEN_ALONE, [(2.0, 4.0)] * 3)
-    np.testing.assert_array_equal(stretch.moved_into(np.array([-7.0, 3.0, 4.5])), [2.0, 3.0, 4.0])
-
-
-def test_a_start_is_moved_by_whole_periods_or_to_the_limit_that_is_nearer_around_the_curve() -> None:
-    """From 7 to 10 on a curve of length 8: 1 is inside, 3 is one past the end, 6 is one before the start."""
-    stretch = stretches(CLOSED_ALONE, [(7.0, 10.0)] * 5)
-    found = stretch.moved_into(np.array([7.5, 1.0, -15.0, 3.0, 6.0]))
-    np.testing.assert_allclose(found, [7.5, 9.0, 9.0, 10.0, 7.0], atol=1e-12)
-
-
-def test_places_come_back_into_the_domain() -> None:
-    v = np.array([-1.0, 3.0, 19.0])
-    np.testing.assert_array_equal(stretches(OPEN_ALONE, [(0.0, 10.0)] * 3).in_domain(v), [0.0, 3.0, 10.0])
-    np.testing.assert_allclose(stretches(CLOSED_ALONE, [(0.0, 8.0)] * 3).in_domain(v), [7.0, 3.0, 3.0])
-
-
-def test_each_row_s_stretch_lies_on_the_axis_of_its_own_curve() -> None:
-    spans = lay_out([OPEN, OPEN], [0, 13])
-    shift: Array = spans.shift
-    stretch = stretches(spans, [(2.0, 4.0), (2.0, 40.0)], np.array([0, 1]))
-    assert_limits(stretch, [2.0, 2.0 + shift[1]], [4.0, 10.0 + shift[1]])
-    assert shift[1] > 10.0
-    second = stretch.where(np.array([False, True]))
-    assert_limits(second, [2.0 + shift[1]], [10.0 + shift[1]])
-    assert second.begin.tolist() == [shift[1]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pathspace_graph.factors._kernels import Curves
@@ -79,7 +79,6 @@ def curves(draw: st.DrawFn) -> tuple[SpanPolynomials, Array, np.random.Generator
     return SpanPolynomials(knots, degree), points, rng
 
 
-@settings(max_examples=80, deadline=None)
 @given(curve=curves())
 def test_no_point_of_a_dense_grid_is_nearer(
     curve: tuple[SpanPolynomials, Array, np.random.Generator],
@@ -98,7 +97,6 @@ def test_no_point_of_a_dense_grid_is_nearer(
     assert (found <= to_grid.min(axis=1) + 1e-6).mean() > (0.9 if tables.degree > 1 else 0.75)
 
 
-@settings(max_examples=80, deadline=None)
 @given(curve=curves(), share=st.floats(0.0, 1.2))
 def test_foot_points_stay_in_their_stretch(
     curve: tuple[SpanPolynomials, Array, np.random.Generator], share: float
@@ -228,7 +226,6 @@ def test_a_polygon_finds_its_corners_and_its_edges() -> None:
     np.testing.assert_allclose(feet.distance[[0, 2]], [0.7, 1.0], atol=1e-9)
 
 
-@settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_warm_start_never_ends_farther_away_and_converges(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""The GTSAM factors against the vectorized kernels: the same linear system, the same optimum."""
+"""The GTSAM factors: their Jacobians, their keys, and what they refuse."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.bspline import SpanPolynomials, periodic_knots
+from pathspace_graph.factors.bspline import SpanPolynomials, periodic_knots, uniform_knots
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.gtsam_factors import (
     boundary_point_factor,
@@ -18,96 +18,31 @@ from pathspace_graph.factors.gtsam_factors import (
     spline_projection_factors,
 )
 from pathspace_graph.factors.linear import linear_factor
-from pathspace_graph.factors.odometry import IntegratedOdometry
+from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
 from pathspace_graph.factors.residuals import greville, smoothness_matrix
-from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE
 
 from ..scenes.jacobians import assert_jacobians
-from .window_in_gtsam import (
-    CONTROL_KEYS,
-    DEGREE,
-    HUBER,
-    MAP,
-    POSES,
-    SIGMA_MODEL,
-    SIZE,
-    TABLES,
-    Scene,
-    all_rows,
-    curves,
-    dense,
-    detection_rows,
-    in_tangents,
-    integrate_noisy,
-    make_scene,
-    nonlinear_graph,
-    projection_factor,
-    solve_window,
-    to_state,
-    to_values,
-)
+
+DEGREE, SIZE = 3, 11
+SIGMA_MODEL, HUBER = 0.08, 1.5
+TABLES = SpanPolynomials(uniform_knots(SIZE, DEGREE, 3.5), DEGREE)
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["isotropic", "anisotropic"])
-def scene(request: pytest.FixtureRequest) -> Scene:
-    return make_scene(0, isotropic=request.param)
-
-
-def test_the_factors_linear_system_is_that_of_the_kernels_rows(scene: Scene) -> None:
-    """Far from the optimum, with outliers weighed down, and the poses turned."""
-    state = scene.state + np.random.default_rng(1).normal(0.0, 0.05, scene.state.shape)
-    state[MAP + 2 : MAP + 2 + POSE] = scene.start  # the prior's tangent is the state's only where it holds
-    groups = all_rows(scene, state)
-    assert (np.abs(detection_rows(scene, 0, state)[2]) > np.sqrt(HUBER)).any()
-    J, r = dense(groups, len(state))
-    J = in_tangents(scene, state, J)
-    poses = [gtsam.symbol("x", k) for k in range(POSES)]
-    ordering = gtsam.Ordering([*CONTROL_KEYS[0], *CONTROL_KEYS[1], CALIBRATION_KEY, *poses])
-    hessian, negative_gradient = nonlinear_graph(scene).linearize(to_values(scene, state)).hessian(ordering)
-    np.testing.assert_allclose(hessian, J.T @ J, atol=1e-9 * np.abs(hessian).max(), rtol=0.0)
-    np.testing.assert_allclose(
-        negative_gradient, -J.T @ r, atol=1e-9 * np.abs(negative_gradient).max(), rtol=0.0
-    )
-
-
-@pytest.mark.parametrize(
-    ("seed", "isotropic", "allowed"), [(0, True, 1e-6), (1, True, 1e-6), (2, False, 5e-3)]
-)
-def test_levenberg_marquardt_reaches_the_windows_optimum(seed: int, isotropic: bool, allowed: float) -> None:
-    """Curves and poses to 1e-6 m where sigma doesn't turn with the normal.
-
-    Where it does, Levenberg-Marquardt looks at an error whose derivative isn't quite the gradient that it was
-    given, and stops when no step lowers it: millimetres at most, here.
-    """
-    scene = make_scene(seed, isotropic)
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(0.0)
-    parameters.setAbsoluteErrorTol(1e-13)
-    values = to_values(scene, scene.state)
-    found = to_state(gtsam.LevenbergMarquardtOptimizer(nonlinear_graph(scene), values, parameters).optimize())
-    expected = solve_window(scene)
-    np.testing.assert_allclose(curves(scene, found), curves(scene, expected), atol=allowed)
-    np.testing.assert_allclose(scene.poses(found), scene.poses(expected), atol=allowed)
-    assert np.abs(curves(scene, found) - curves(scene, scene.state)).max() > 0.05
-
-
-def test_gauss_newton_reaches_the_windows_optimum(scene: Scene) -> None:
-    """GTSAM's own Gauss-Newton stands still where the window does, whatever the covariances."""
-    optimizer = gtsam.GaussNewtonOptimizer(nonlinear_graph(scene), to_values(scene, scene.state))
-    for _ in range(25):
-        optimizer.iterate()
-    found, expected = to_state(optimizer.values()), solve_window(scene)
-    np.testing.assert_allclose(curves(scene, found), curves(scene, expected), atol=1e-6)
-    np.testing.assert_allclose(scene.poses(found), scene.poses(expected), atol=1e-6)
+def integrate_noisy(rng: np.random.Generator) -> IntegratedOdometry:
+    """Returns nine samples of 0.02 s at 10 m/s in the bend."""
+    sigma = np.array([0.25, 0.12, 0.035])
+    return integrate_twists(np.full(9, 0.02), [10.0, 0.0, 0.4] + rng.normal(size=(9, 3)) * sigma, sigma)
 
 
 def test_error_is_hubers_loss_and_its_derivative_is_the_linearizations_gradient() -> None:
     """So that an optimizer that judges its steps by the error judges the rows that it was given."""
-    scene = make_scene(2)
-    factor = projection_factor(scene, 0, 3)
-    graph = gtsam.NonlinearFactorGraph()
+    points = np.array([[9.5, 0.4], [10.0, 0.05], [10.5, -0.5]])
+    factor, values = straight_factor(np.array([9.5, 10.0, 10.5]), points, HUBER)
+    graph, rng = gtsam.NonlinearFactorGraph(), np.random.default_rng(2)
     graph.add(factor)
-    values = to_values(scene, scene.state)
+    values.update(99, gtsam.Pose2(0.1, -0.05, 0.02))
+    for j in range(SIZE):
+        values.update(j, values.atPoint2(j) + rng.normal(0.0, 0.05, 2))
     assert np.abs(factor.unwhitenedError(values)).max() > HUBER
     gradient = graph.linearize(values).gradientAtZero()
     for key in list(factor.keys()):
@@ -213,7 +148,9 @@ def whole_period_search(tables: SpanPolynomials, distinct: Array, points: Array)
     return foot_points(tables, unwrapped, points, *ends, 0.5).u
 
 
-def straight_factor(u: Array, points: Array) -> tuple[gtsam.CustomFactor, gtsam.Values]:
+def straight_factor(
+    u: Array, points: Array, huber: float = np.inf
+) -> tuple[gtsam.CustomFactor, gtsam.Values]:
     """Readings beside a straight boundary along the x axis, from a pose at the origin."""
     (factor,) = spline_projection_factors(
         np.full(len(u), 99),
@@ -224,7 +161,7 @@ def straight_factor(u: Array, points: Array) -> tuple[gtsam.CustomFactor, gtsam.
         low=u - 1.0,
         high=u + 1.0,
         sigma_model=SIGMA_MODEL,
-        huber=np.inf,
+        huber=huber,
     )
     values = gtsam.Values()
     values.insert(99, gtsam.Pose2())

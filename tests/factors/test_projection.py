@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
@@ -105,7 +105,6 @@ def points_beside(
     return points[keep], u[keep]
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     degree=st.integers(1, 4),

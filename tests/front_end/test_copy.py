@@ -13,9 +13,9 @@ from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
 
-from ..oracles.copied import copied
 from ..scenes.digest import digest
 from ..scenes.drives import short_drive
+from ..shared.copied import copied
 
 Cycle = tuple[Odometry, Detections]
 

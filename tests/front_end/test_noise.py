@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.noise import ASSUMED_DRIFT, KnownNoise, MeasuredNoise, RayNoise
+from pathspace_graph.front_end import noise as noise_module
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log, measure_log
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.io.log import Log
@@ -122,6 +123,18 @@ def test_what_is_not_measured_yet_is_assumed() -> None:
     assert not odometry_only.is_settled
     assert odometry_only.for_map(seen).covariances is seen.covariances
     assert odometry_only.calibrated(SETTINGS) is SETTINGS
+
+
+def test_a_gap_of_five_seconds_is_one_second_of_driving(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first measurement begins after 8 s of driving, which the ninth of these cycles completes."""
+    began, known, log = list[int](), learner(None), short_drive()
+    monkeypatch.setattr(noise_module, "begun", lambda cycles, *_, **__: began.append(len(cycles)))
+    motion = FrontEnd(SETTINGS, log.noise).update(*next(split_odometry(log))).motion
+    twist = replace(motion.odometry, twist=np.array([5.0, 0.0, 0.0]))
+    for k in range(9):
+        seen = detections(5.0 * k, np.zeros((0, 2)), np.zeros(0, np.intp))
+        known.observe(log.odometry, seen, replace(motion, odometry=twist), np.zeros(3))
+        assert began == ([9] if k == 8 else [])
 
 
 # --- calibrations ----------------------------------------------------------------------------------------
@@ -245,6 +258,18 @@ def test_where_the_ranges_are_trusted_the_speeds_take_the_whole_ratio() -> None:
     expected = np.where(np.arange(5) == 3, 0.0, ERRORS)
     np.testing.assert_array_equal(found.calibration.means, expected)
     assert found.calibration.sigma_range_scale == settings.calibration.sigma_range_scale
+
+
+@pytest.mark.parametrize("share", [0.5, 2.0])
+def test_a_measured_error_is_no_more_certain_than_before_and_no_less_than_measured(share: float) -> None:
+    """Sigmas of half the prior's give the prior's, and of twice the prior's themselves."""
+    prior = np.array(SETTINGS.calibration.sigmas)
+    measured = replace(noise(np.array([0.2, 0.0, 0.0, 0.0, 0.0])), sensor_sigma=share * prior)
+    by_ranges = replace(SETTINGS, calibration=CalibrationSettings(trust="ranges"))
+    found = np.array(learner(measured).calibrated(by_ranges).calibration.sigmas)
+    expected = max(share, 1.0) * prior
+    expected[3] = prior[3]  # what the ranges are trusted for
+    np.testing.assert_allclose(found, expected)
 
 
 def test_odometry_sets_the_size_of_the_map_where_a_range_is_known_worse_than_its_scale() -> None:

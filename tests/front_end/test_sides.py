@@ -71,6 +71,17 @@ def test_colours_are_swapped_by_a_clear_majority(agreeing: int, opposing: int, s
     assert is_swapped(judge, 0, agreeing, opposing) is swapped
 
 
+def test_a_cone_that_was_first_seen_out_of_reach_votes_later() -> None:
+    """Three cones of the other side's colour are 10 m ahead, beyond the reach, and 5 m ahead a second on."""
+    judge, points = SideJudge(SidesSettings()), np.array([[10.0, 2.0], [10.0, -2.0], [11.5, 2.0]])
+    labels = np.where(points[:, 1] > 0.0, RIGHT, LEFT)
+    for k, x in enumerate((0.0, 5.0)):
+        judge.update(
+            np.array([x, 0.0, 0.0]), np.array([[5.0, 0.0, 0.0]]), detections(k, points - [x, 0.0], labels)
+        )
+        assert judge.swapped is (k == 1)
+
+
 @pytest.mark.parametrize(("agreeing", "swapped"), [(7, True), (8, False)])
 def test_colours_are_swapped_back_by_as_clear_a_majority(agreeing: int, swapped: bool) -> None:
     """Three cones were on the other side."""
@@ -121,6 +132,13 @@ def test_colours_count_again_once_most_of_the_newest_detections_have_one() -> No
         judge.update(np.zeros(3), np.zeros((1, 3)), detections(0.1 * k, points, labels))
         said.append(judge.colourless)
     assert said[0] and said.index(False) == 400 + 17
+
+
+@pytest.mark.parametrize(("count", "colourless"), [(5, False), (6, True)])
+def test_a_few_detections_do_not_tell_that_a_log_has_no_colours(count: int, colourless: bool) -> None:
+    judge = SideJudge(SidesSettings())
+    judge.update(np.zeros(3), np.zeros((1, 3)), detections(0.0, PLACES[:count], np.full(count, UNKNOWN)))
+    assert judge.colourless is colourless
 
 
 def test_where_colours_are_common_an_unknown_one_stays_unknown() -> None:

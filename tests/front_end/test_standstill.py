@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.front_end.motion import MotionCheck
+from pathspace_graph.front_end.standstill import Standstill
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.motion import MeasuredMotion
@@ -179,3 +180,16 @@ def test_detections_before_other_noise_are_not_compared() -> None:
 def test_an_odometry_that_is_always_believed_is_believed_here() -> None:
     true, check = np.zeros(20), MotionCheck(TwistNoise(TWIST_SIGMA), MotionSettings(doubt=np.inf))
     assert not any(motion.fault for motion in motions(true, true + 1.3, 0, check=check))
+
+
+@pytest.mark.parametrize(("speed", "stands"), [(2.0, True), (4.0, False)])
+def test_wheels_that_turn_faster_than_a_creep_are_not_compared_with_earlier_cycles(
+    speed: float, stands: bool
+) -> None:
+    """The same cones are seen for a second, during which odometry tells a speed in the last cycle alone."""
+    standstill, points = Standstill(), rows(np.random.default_rng(0))
+    covariances = np.tile(0.01 * np.eye(2), (len(points), 1, 1))
+    for k in range(11):
+        delta = np.array([PERIOD * speed if k == 10 else 0.0, 0.0, 0.0])
+        standstill.add(PERIOD * k, points, covariances, delta)
+    assert (standstill.place(1.0) is not None) is stands

@@ -185,6 +185,19 @@ def test_links_that_come_back_are_what_they_were(seed: int) -> None:
     assert_same_system(drive.system(whole), drive.system(drive.whole))
 
 
+def test_a_copy_of_a_chain_keeps_what_the_chain_gives_back() -> None:
+    drive = Drive(0)
+    variables, chain = drive.variables.copy(), drive.chain
+    chain.refresh(variables)
+    other, again, poses = chain.copy(), variables.copy(), dict(chain.poses)
+    first = [chain.detach(variables) for _ in range(3)]
+    assert chain.poses == {} and other.poses == poses
+    second = [other.detach(again) for _ in range(3)]
+    np.testing.assert_array_equal(again.values, variables.values)
+    for one, two in zip(first, second, strict=True):
+        assert one.equals(two, 1e-12)
+
+
 class Flag:
     """A point that goes where the map goes."""
 

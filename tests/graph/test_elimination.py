@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pathspace_graph.errors import SingularSystemError
@@ -79,7 +79,6 @@ def scene(seed: int, poses: int, points: int) -> tuple[Elimination, Array, Array
     return problem, *dense(groups, variables.layout)
 
 
-@settings(deadline=None)
 @given(*SIZES)
 def test_the_solution_is_that_of_the_dense_system(seed: int, poses: int, points: int) -> None:
     """The solution is a change from the values, whatever the references are."""
@@ -111,7 +110,6 @@ def test_poses_given_a_fixed_map() -> None:
     np.testing.assert_allclose(alone.pose_marginals[-1], last, atol=1e-9)
 
 
-@settings(deadline=None)
 @given(*SIZES)
 def test_covariances_are_blocks_of_the_dense_inverse(seed: int, poses: int, points: int) -> None:
     problem, matrix, _ = scene(seed, poses, points)

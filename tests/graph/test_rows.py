@@ -7,7 +7,7 @@ import gc
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pathspace_graph.factors._kernels import odometry_residuals
@@ -77,7 +77,6 @@ def test_all_factors_together_are_the_dense_normal_equations(seed: int) -> None:
     np.testing.assert_allclose(np.linalg.solve(hessian, vector), moved + step, atol=1e-9)
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 12))
 def test_each_owner_s_factor_holds_its_rows_and_no_other(seed: int, owners: int) -> None:
     """On the keys of its rows alone, in ascending order; also where owners' rows are mixed, and many lack."""

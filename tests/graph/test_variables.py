@@ -166,7 +166,7 @@ POOL = np.sort(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(
     st.lists(
         st.tuples(st.booleans(), st.sets(st.integers(0, len(POOL) - 1), min_size=1, max_size=9)), max_size=8

@@ -20,7 +20,6 @@ from pathspace_graph.settings.mapper import Knots, MapperSettings
 from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import relocate
 
-from ..oracles.copied import copied
 from ..scenes.drives import (
     ODOMETRY_SIGMA,
     ahead,
@@ -32,6 +31,7 @@ from ..scenes.drives import (
     mapped,
     true_poses,
 )
+from ..shared.copied import copied
 
 Array = NDArray[np.float64]
 

@@ -141,3 +141,10 @@ def test_a_lap_is_solved_with_the_noise_that_is_known_when_it_closes() -> None:
     np.testing.assert_allclose(found, expected.covariance, atol=2.0 * MIN_SIGMA**2)
     np.testing.assert_array_equal(lap.detections.covariance, noise.for_map(cone).covariances[[0, 0]])
     assert lap.detections.covariance[0, 0, 0] > 100.0 * cone.covariances[0, 0, 0]
+
+
+def test_headings_between_two_known_poses_turn_the_short_way() -> None:
+    """The last known heading is a turn more than the first, which is the same direction."""
+    poses = np.column_stack([np.arange(5.0), np.zeros((5, 2))])
+    bent = bend(poses, {0: poses[0], 4: poses[4] + [0.0, 0.0, 2.0 * np.pi]})
+    np.testing.assert_allclose(bent[:4], poses[:4], atol=1e-9)

@@ -21,8 +21,8 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from ..oracles.copied import copied
 from ..scenes.drives import bean_track, replay
+from ..shared.copied import copied
 
 Array = NDArray[np.float64]
 

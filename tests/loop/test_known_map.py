@@ -110,6 +110,16 @@ def test_the_path_of_before_is_laid_on_the_map() -> None:
     assert np.hypot(*(mapper.smoothed(stamps) - truth)[:, :2].T).max() < 0.4
 
 
+def test_the_driven_path_is_laid_on_the_map() -> None:
+    """Most of it was driven before the vehicle was found, after 4 s."""
+    log, begin = begun_later(laps_log(pear_track()), 7.0)
+    mapper = FixedLagMapper.on(pear_map(), None, ODOMETRY_SIGMA)
+    first = placed(drive_on(mapper, log, 4.5))
+    truth = np.array([compose(begin, pose) for pose in true_poses(log)])
+    assert mapper.road.path.stations[0] == 0.0 and first > 30
+    assert KDTree(truth[:, :2]).query(mapper.road.path.points)[0].max() < 1.0
+
+
 def test_on_the_map_of_another_track_the_vehicle_is_never_found() -> None:
     log = laps_log(pear_track())
     mapper = FixedLagMapper.on(pear_map(skew=0.35), None, ODOMETRY_SIGMA)

@@ -33,11 +33,11 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..oracles.copied import copied
 from ..scenes.drives import map_log, mapped, replay, true_poses
 from ..scenes.drives import noisy_lap as log
 from ..scenes.holes import unseen
 from ..scenes.kidnapped import laps_log, pear_track
+from ..shared.copied import copied
 from ..shared.laps import IN_A_PROCESS, solved
 
 Work = Callable[..., Any]

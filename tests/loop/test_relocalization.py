@@ -22,16 +22,16 @@ from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.known_loop import KnownLoop, evidence_of, lay_out_loop
-from pathspace_graph.loop.relocalization import FOUND, SEARCH_MEMORY, Search, restart_window
+from pathspace_graph.loop.relocalization import FOUND, SEARCH_MEMORY, SIGMAS_PLACE, Search, restart_window
 from pathspace_graph.mapping.registration import Matches, Motion, RefinedMotion
 from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..oracles.copied import copied
 from ..scenes.drives import ODOMETRY_SIGMA, Mapped, detections, map_beginning, map_log, replay, true_poses
 from ..scenes.kidnapped import laps_log, pear_track, put_down
+from ..shared.copied import copied
 
 Array = NDArray[np.float64]
 
@@ -203,6 +203,16 @@ def test_the_prior_of_a_place_that_was_found_has_three_times_the_sigmas_of_its_r
     smoother.map.detections.release(np.arange(len(smoother.map.detections)))
     newest = pose_keys(np.array([smoother.next_cycle - 1]))
     np.testing.assert_allclose(smoother.covariance(newest), 9.0 * covariance, atol=1e-6)
+
+
+def test_what_was_seen_counts_a_ninth_at_a_place_where_it_is_seen_again() -> None:
+    """Of the information at the place, a part is the prior's and stays."""
+    search = Search(clean()[1].road)
+    prior = np.diag(np.array(SIGMAS_PLACE) ** -2.0)
+    seen = np.array([[25.0, 3.0, 0.0], [3.0, 100.0, -20.0], [0.0, -20.0, 900.0]])
+    nothing = Matches(np.zeros(0, np.intp), *[np.zeros(0)] * 4, np.zeros((3, 3)), np.zeros(3))  # type: ignore[arg-type]
+    found = RefinedMotion(Motion(np.zeros(2), np.zeros(3)), nothing, np.linalg.inv(prior + seen))
+    np.testing.assert_allclose(np.linalg.inv(search.widened(found)), prior + seen / 9.0, atol=1e-9)
 
 
 def test_no_place_is_found_with_too_few_detections() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache, partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +11,12 @@ import pytest
 from pathspace_graph import FixedLagMapper, MapperSettings
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import move_points, to_vehicle
 from pathspace_graph.graph.relative import revisit_rows
 from pathspace_graph.io.log import Log
+from pathspace_graph.loop import revisit as revisit_module
 from pathspace_graph.loop.revisit import Revisits, earlier_pass
+from pathspace_graph.mapping.registration import Matches, Motion, RefinedMotion
 from pathspace_graph.run import CycleResult
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
@@ -53,6 +57,55 @@ def test_a_road_that_is_crossed_or_driven_the_other_way_is_none(turn: float) -> 
     assert earlier_pass(crossing) is None
     back = there[::-1] + np.array([0.0, 0.0, np.pi])
     assert earlier_pass(np.concatenate([there, back])) is None
+
+
+def test_an_opposite_pass_whose_ways_part_is_none() -> None:
+    """The vehicle turns in a loop at the end of a road, and drives back on it after another way."""
+    way = along((40.0, 0.0), (60.0, 0.0), (1.5 * np.pi * 10.0, 0.1), (20.0, 0.0))
+    back = np.array([70.0, 0.5, np.pi])
+    elsewhere = along((12.0, 0.0)) + np.array([90.0, 40.0, 0.0])
+    passes = np.concatenate([way, elsewhere, back[None]])
+    assert earlier_pass(passes) is None
+    passes[-1, 2] = 0.0
+    assert earlier_pass(passes) == pytest.approx(70, abs=1)
+
+
+def test_what_is_fixed_to_the_vehicle_stays_so_after_a_jump_that_turns(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Path, tracks and cones move by the motion that takes the newest pose from before to after."""
+    before, after = np.array([10.0, 4.0, 0.5]), np.array([12.0, -3.0, 1.7])
+    cone, moved = np.array([[15.0, 6.0]]), list[Array]()
+    road = SimpleNamespace(
+        poses=before[None].copy(), smoother=None, settings=MapperSettings(), move=moved.append
+    )
+
+    def solve(*_: object) -> dict[int, Array]:
+        road.poses[-1] = after
+        return {}
+
+    monkeypatch.setattr(revisit_module, "solve_revisit", solve)
+    record, measured = SimpleNamespace(bent=lambda *_: None), SimpleNamespace(factor=lambda: None)
+    jump = revisit_module.lay_on(road, record, measured)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(jump, after - before)
+    seen = to_vehicle(cone, before[None])
+    np.testing.assert_allclose(to_vehicle(move_points(moved[0], cone), after[None]), seen, atol=1e-9)
+
+
+def test_a_place_by_shape_is_less_certain_by_the_bend_of_the_newest_stretch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The registration is rigid: 1.5 m and 0.15 rad of drift within the stretch are added."""
+    covariance = np.diag([0.04, 0.09, 0.0004]) + 0.001
+    nothing = Matches(np.zeros(0, np.intp), *[np.zeros(0)] * 4, np.zeros((3, 3)), np.zeros(3))  # type: ignore[arg-type]
+    found = RefinedMotion(Motion(np.zeros(2), np.zeros(3)), nothing, covariance)
+    for name, value in (("is_recognizable", True), ("is_lost", True), ("find_place", found)):
+        monkeypatch.setattr(revisit_module, name, lambda *_, known=value: known)
+    smoother = drives.mapped(drives.exact_lap())[0].road.smoother
+    monkeypatch.setattr(smoother, "transform_to_origin", lambda: None)
+    place = revisit_module.recognize(smoother)
+    assert place is not None and place.motion is found.motion
+    np.testing.assert_allclose(place.covariance - covariance, np.diag([2.25, 2.25, 0.0225]), atol=1e-12)
 
 
 # --- the drive of a skidpad ------------------------------------------------------------------------------

@@ -116,9 +116,11 @@ class Swap:
     """Hessian (n, n) and negative gradient (n,) of the marginal and of each later measurement, once."""
     covariance: Array
     """(n, n) What the smoother claims of all variables."""
+    associated_with: Array
+    """(k,) Calibrations by which the detections were associated with the new curves."""
 
 
-def swap_of(smoother: CurveSmoother, marginal: LapMarginal) -> Swap:
+def swap_of(smoother: CurveSmoother, marginal: LapMarginal, associated_with: Array) -> Swap:
     """Returns the state of a smoother, and the dense system that it must have."""
     smoother.refresh()
     variables, points = smoother.variables, smoother.map.state.map_keys
@@ -134,7 +136,9 @@ def swap_of(smoother: CurveSmoother, marginal: LapMarginal) -> Swap:
     hessian[np.ix_(own, own)] += marginal.information
     gradient[own] += marginal.information @ (variables.of(keys) - marginal.mean)
     claimed = smoother.covariance(variables.keys)
-    return Swap(marginal, smoother.prior, variables.copy(), keys, (hessian, -gradient), claimed)
+    return Swap(
+        marginal, smoother.prior, variables.copy(), keys, (hessian, -gradient), claimed, associated_with
+    )
 
 
 @cache
@@ -142,12 +146,17 @@ def swapped() -> tuple[Swap, OpenLap]:
     """Returns the swap of a drive, and the lap that was solved for it."""
     swaps: list[Swap] = []
     laps: list[OpenLap] = []
-    take, record = drives.swap_in, DriveRecord.lap
+    calibrations: list[Array] = []
+    take, record, associate = drives.swap_in, DriveRecord.lap, CurveSmoother.reassociate
 
     def swap_in(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
         jump = take(smoother, marginal)
-        swaps.append(swap_of(smoother, marginal))
+        swaps.append(swap_of(smoother, marginal, calibrations[-1]))
         return jump
+
+    def reassociate(self: CurveSmoother) -> None:
+        calibrations.append(self.variables.calibrations.copy())
+        associate(self)
 
     def lap(self: DriveRecord, *arguments: Any, **options: Any) -> OpenLap:
         laps.append(record(self, *arguments, **options))
@@ -156,6 +165,7 @@ def swapped() -> tuple[Swap, OpenLap]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drives, "swap_in", swap_in)
         patch.setattr(DriveRecord, "lap", lap)
+        patch.setattr(CurveSmoother, "reassociate", reassociate)
         mapper, known = open_lap()
         for odometry, detections in islice(split_odometry(log()), len(known), None):
             replay(mapper, odometry, detections)
@@ -175,6 +185,12 @@ def test_the_prior_after_the_swap_is_the_marginal() -> None:
     reference = swap.variables.reference[swap.variables.layout.entries(swap.keys)]
     mean = reference + np.linalg.solve(information, vector)
     np.testing.assert_allclose(mean, swap.marginal.mean, atol=1e-9)
+
+
+def test_detections_are_associated_with_the_new_curves_by_the_calibration_of_the_batch() -> None:
+    swap, _ = swapped()
+    np.testing.assert_array_equal(swap.associated_with, swap.marginal.calibration)
+    assert len(swap.associated_with) > 2  # the sensor's too
 
 
 def test_the_window_has_every_measurement_once() -> None:

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import compose, left_of, path_lengths, relative, rotation, to_map, to_vehicle
 from pathspace_graph.io.log import Detections
@@ -37,6 +38,7 @@ from pathspace_graph.mapping.tentative import TentativeTracks, merged_in_turn
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import path_of
+from . import laid_in_numpy
 
 SETTINGS = MapperSettings()
 GROWTH = SETTINGS.growth
@@ -110,6 +112,18 @@ def test_what_is_expected_counts_until_odometry_has_failed() -> None:
         assert laid.odds == pytest.approx(NEW_ROAD - cost, abs=1e-3)
 
 
+@pytest.mark.parametrize("away", [(3.6, 0.0, 0.0), (-2.4, 2.6, 0.2)])
+def test_a_place_far_from_where_it_is_expected_is_found_among_many_cones(
+    away: tuple[float, float, float],
+) -> None:
+    """Wrong places near the mean have votes too, but the distance counts only until odometry has failed."""
+    known = scattered(60)
+    sure = np.diag(np.array([0.01, 0.01, 0.001]) ** -2.0)
+    laid = lay(beside(known, slice(30)), known, POSE + np.array(away), sure, REACH)
+    assert laid is not None and laid.is_sure
+    np.testing.assert_allclose(laid.pose, POSE, atol=1e-3)
+
+
 def test_the_heading_may_have_turned_around() -> None:
     known = scattered()
     mean = POSE + np.array([0.4, 0.4, 2.0 * np.pi])
@@ -134,6 +148,33 @@ def test_the_information_is_that_of_repeated_observations() -> None:
             off = laid.pose - POSE
             squares.append(off @ laid.information @ off / 3.0)
         assert least < np.mean(squares) < most
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_compiled_places_are_those_in_numpy(seed: int) -> None:
+    """Cones of two colours, the same with noise from a pose, views of them, and what is expected of it."""
+    rng = np.random.default_rng(seed)
+
+    def spread(size: int, count: int = 1) -> Array:
+        roots = rng.normal(size=(count, size, size))
+        return roots @ roots.transpose(0, 2, 1)
+
+    points, labels, pose = rng.uniform(-12.0, 12.0, (17, 2)), rng.integers(0, 2, 17), POSE * [10.0, 10.0, 2.0]
+    seen = to_vehicle(points + pose[:2], pose[None]) + 0.1 * rng.normal(size=(17, 2))
+    views = np.column_stack(
+        [pose + rng.normal(size=(3, 3)), rng.uniform(5.0, 15.0, 3), rng.uniform(0.3, 2.0, 3)]
+    )
+    arguments = (
+        (seen, 0.01 * spread(2, 17), labels),
+        (points + pose[:2], 0.01 * spread(2, 17), labels),
+        views,
+        pose + np.array([0.7, -0.4, 0.1]),
+        0.1 * (spread(3)[0] + np.eye(3)),
+        REACH,
+        (0.25, 9.0, 0.5, 0.05, 1.0, 10.0, 2.0, 20.0),
+    )
+    for found, expected in zip(kernels.laid(*arguments), laid_in_numpy.laid(*arguments), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * max(1.0, np.abs(expected).max()))
 
 
 # --- how sure it is --------------------------------------------------------------------------------------

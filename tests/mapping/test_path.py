@@ -153,3 +153,12 @@ def test_a_rigid_motion_moves_the_way_behind_and_not_the_beginning() -> None:
     np.testing.assert_array_equal(path.stations, stations)
     path.update(np.array([5.0, 3.0, 0.5 * np.pi]))
     assert path.length == pytest.approx(3.0)
+
+
+def test_a_vehicle_that_reverses_after_a_motion_takes_the_path_back() -> None:
+    """Seen from where it was before the motion by 10 m, the step back would be one ahead."""
+    path = driven([0.0, 1.0, 2.0, 3.0])
+    path.move(np.array([10.0, 0.0, 0.0]))
+    path.update(np.array([11.8, 0.0, 0.0]))
+    np.testing.assert_allclose(path.points[:, 0], [10.0, 11.0, 11.8])
+    assert path.length == pytest.approx(1.8)

@@ -11,8 +11,8 @@ from pathspace_graph.mapping import tentative as tentative_module
 from pathspace_graph.mapping.tentative import TentativeTracks
 from pathspace_graph.settings.online import GrowthSettings
 
-from ..oracles.copied import copied
 from ..scenes.digest import digest
+from ..shared.copied import copied
 
 Array = NDArray[np.float64]
 

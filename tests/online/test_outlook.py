@@ -61,6 +61,15 @@ def test_an_open_map_leads_on_through_all_cones_in_sight(mapper: FixedLagMapper)
         np.testing.assert_allclose(found.spline.evaluate(u)[:, 1], side, atol=0.1)
 
 
+def test_a_track_is_as_uncertain_as_its_detections_and_the_curve_beside_it(mapper: FixedLagMapper) -> None:
+    """Cones stand about 0.1 m from a smooth curve."""
+    tracks = mapper.road.growth.tentative[LEFT]
+    found = outlook(mapper)
+    for place, variance in zip(found.tracks, found.variances, strict=True):
+        (row,) = np.flatnonzero(np.hypot(*(tracks.points - place).T) < 1e-9)
+        assert variance == pytest.approx(tracks.variances(np.array([row]))[0] + 0.01)
+
+
 def test_the_confirmed_curve_is_the_same_with_the_stretch_as_without(mapper: FixedLagMapper) -> None:
     u = np.linspace(0.0, mapper.boundaries[LEFT].confirmed_end, 50)
     confirmed = mapper.boundaries[LEFT].evaluate(mapper.control_points(LEFT), u)

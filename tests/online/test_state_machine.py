@@ -320,7 +320,6 @@ def test_no_order_of_cycles_breaks_an_estimator(kind: type[Estimator]) -> None:
         settings=settings(
             max_examples=12,
             stateful_step_count=25,
-            deadline=None,
             derandomize=True,
             suppress_health_check=list(HealthCheck),
         ),

@@ -69,8 +69,8 @@ def test_the_motions_of_a_log_do_not_depend_on_its_odometry() -> None:
     alone, wrong = motions_of(log), motions_of(with_twists_of(log, noise))
     assert len(wrong.rate) > 0.8 * len(alone.rate)
     v, w = Regression(log.odometry, wrong).stated("twist", 0.0)
-    assert (np.abs(wrong.velocity - v) < 2.5).mean() > 0.7
-    assert (np.abs(wrong.rate - w) < 0.4).mean() > 0.7
+    assert (np.abs(wrong.velocity - v) < 2.5).mean() > 0.75
+    assert (np.abs(wrong.rate - w) < 0.4).mean() > 0.85
 
 
 def test_a_log_without_detections_has_no_motions() -> None:
@@ -95,7 +95,7 @@ def moved(fit: Fit, odometry: Odometry = ODOMETRY, noise: float = 0.0) -> Regres
     return Regression(odometry, replace(empty, velocity=v, rate=w))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.floats(0.01, 50.0),
     st.floats(-3.1, 3.1),

@@ -21,7 +21,7 @@ from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.sim.vehicle import VehicleSettings, drive, integrate
 
-from ..oracles.copied import copied
+from ..shared.copied import copied
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

@@ -12,11 +12,11 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults
+from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults, measure_odometry
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
-from pathspace_graph.sim.vehicle import VehicleSettings
+from pathspace_graph.sim.vehicle import Drive, VehicleSettings
 
 from ..scenes.drives import bean_track
 
@@ -201,6 +201,18 @@ def test_a_yaw_rate_bias_is_added_and_is_part_of_the_true_calibration(clean: Log
     assert same_cycles(faulty, clean)
 
 
+def test_a_fault_scales_what_the_wheels_turn_and_not_the_drawn_errors() -> None:
+    """`wheels (1 + drawn + fault)`: the product of both scales is in no reading."""
+    t = 0.02 * np.arange(50)
+    twists = np.column_stack([5.0 + np.sin(t), 0.1 * np.cos(t), 0.3 * np.sin(2.0 * t)])
+    driven, rng = Drive(t, np.zeros((50, 3)), twists), np.random.default_rng(1)
+    noise = OdometryNoise(white=(1e-12, 1e-12, 1e-12), scale=0.1, gyro_bias=0.0)
+    found, calibration = measure_odometry(driven, 1.0, noise, OdometryFaults(speed_scale=0.05), rng)
+    assert abs(calibration[0] - 0.05) > 0.01
+    np.testing.assert_allclose(found.twist[:, :2], (1.0 + calibration[0]) * twists[:, :2], atol=1e-9)
+    np.testing.assert_allclose(found.twist[:, 2], twists[:, 2], atol=1e-9)
+
+
 def test_slipping_wheels_measure_too_much_for_1_s_every_8_s() -> None:
     still = replace(LAPS, odometry=OdometryNoise(scale=0.0))
     clean, faulty = drive(still), drive(still, odometry=OdometryFaults(slip=0.5))
@@ -244,6 +256,27 @@ def test_a_start_below_the_dead_band_is_missed_and_nothing_else() -> None:
     assert np.abs(missed.odometry.twist[differs]).max() < 1e-6
     way = 0.02 * whole.odometry.twist[differs, 0].sum()
     assert way == pytest.approx(0.375, abs=0.05)
+
+
+def test_a_slow_start_is_missed_only_after_a_standstill() -> None:
+    """A log may begin on a vehicle that creeps, whose odometry has not stood."""
+    t = 0.02 * np.arange(6)
+    for first in (0.4, 0.0):
+        twists = np.array([first, 0.5, 0.8, 1.2, 0.7, 0.6])[:, None] * [1.0, 0.0, 0.0]
+        noise = OdometryNoise(white=(1e-12, 1e-12, 1e-12), scale=0.0, gyro_bias=0.0)
+        driven, rng = Drive(t, np.zeros((6, 3)), twists), np.random.default_rng(1)
+        found, _ = measure_odometry(driven, 1.0, noise, OdometryFaults(dead_band=1.0), rng)
+        missed = [0.0] * 3 + [1.2, 0.7, 0.6] if first == 0.0 else twists[:, 0]
+        np.testing.assert_allclose(found.twist[:, 0], missed, atol=1e-9)
+
+
+def test_false_travel_goes_on_for_its_time_while_the_vehicle_stands() -> None:
+    t = 0.02 * np.arange(7)
+    twists = np.array([2.0, 1.0, 0.3, 0.0, 0.0, 0.0, 0.0])[:, None] * [1.0, 0.0, 0.0]
+    noise = OdometryNoise(white=(1e-12, 1e-12, 1e-12), scale=0.0, gyro_bias=0.0)
+    faults, rng = OdometryFaults(false_travel=0.5, false_travel_time=0.04), np.random.default_rng(1)
+    found, _ = measure_odometry(Drive(t, np.zeros((7, 3)), twists), 1.0, noise, faults, rng)
+    np.testing.assert_allclose(found.twist[:, 0], [2.0, 1.0, 0.5, 0.5, 0.5, 0.0, 0.0], atol=1e-9)
 
 
 def test_a_log_that_begins_with_a_gap_still_has_its_first_stamp() -> None:

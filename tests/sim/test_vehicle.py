@@ -6,14 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
 from scipy.spatial import cKDTree
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.laps import lap_end_indices
+from pathspace_graph.sim.curves import CentreLine, left_normals
 from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import generate_track
-from pathspace_graph.sim.vehicle import Drive, VehicleSettings, drive, integrate
+from pathspace_graph.sim.vehicle import Drive, VehicleSettings, _settling, _wander, drive, integrate
 
 
 def generated(seed: int) -> Track:
@@ -73,7 +75,7 @@ def test_speed_and_acceleration_limits(driven: tuple[Track, Drive]) -> None:
     assert 8.0 < speed.max() <= 12.0 * 1.01
     assert np.abs(speed * d.twists[:, 2]).max() <= 5.0 * 1.15
     along = np.diff(speed) / 0.02
-    assert along.min() >= -4.0 * 1.1
+    assert -4.0 * 1.1 <= along.min() < -3.3  # it brakes harder than it speeds up
     assert along.max() <= 3.0 * 1.1
     # the heading is that of the path: no side-slip beyond what a step of the odometry turns
     assert np.abs(d.twists[:, 1]).max() < 0.1
@@ -133,6 +135,37 @@ def test_open_track_is_driven_once_from_an_odd_start_pose() -> None:
     end = np.array([[cos, -sin], [sin, cos]]) @ d.poses[-1, :2] + [0.0, 0.3]
     assert end[0] == pytest.approx(60.0, abs=1.0)
     assert abs(end[1]) < 0.05
+
+
+def test_a_start_beside_a_bend_begins_in_its_own_direction() -> None:
+    """2 m inside a circle of 10 m, a metre of the middle line is 0.8 m of the path beside it."""
+    at = np.linspace(0.0, 20.0 * np.pi, 401)
+    circle = 10.0 * np.column_stack([np.cos(at / 10.0), np.sin(at / 10.0)])
+    circle[-1] = circle[0]
+    line = CentreLine(CubicSpline(at, circle, bc_type="periodic"), at[-1], True, np.full(401, 2.0))
+    pose = line.points(np.array([0.0]))[0] + 2.0 * left_normals(line.tangents(np.array([0.0])))[0]
+    heading = np.arctan2(*line.tangents(np.array([0.0]))[0][::-1]) + 0.3
+    s = np.array([0.0, 1e-4])
+    offset = _settling(line, 0.0, np.append(pose, heading), s, VehicleSettings())
+    path = line.points(s) + left_normals(line.tangents(s)) * offset[:, None]
+    assert np.arctan2(*np.diff(path, axis=0)[0][::-1]) == pytest.approx(heading, abs=1e-3)
+
+
+def test_a_vehicle_brakes_before_it_stands() -> None:
+    d = drive(generated(0), 1, VehicleSettings(stand=2.0), np.random.default_rng(0))
+    standing = np.flatnonzero(d.twists.any(axis=1))[-1] + 1
+    assert len(d.t) - standing == pytest.approx(100, abs=2)
+    assert 0.0 <= d.twists[standing - 1, 0] < 4.0 * 0.02 * 2.0
+    assert d.twists[standing - 25, 0] < 2.5
+
+
+def test_the_wander_begins_in_the_middle() -> None:
+    """It grows like the square of the distance, by `1 - exp(-(s / 5 m)^2)`."""
+    s = np.array([0.0, 0.5, 20.0])
+    offsets = [_wander(s, np.full(3, 5.0), VehicleSettings(), np.random.default_rng(k)) for k in range(20)]
+    least, near, far = np.abs(offsets).max(axis=0)
+    assert least == 0.0 and near < 0.003
+    assert 0.2 < far < 0.3
 
 
 def test_start_speed() -> None:

@@ -81,7 +81,7 @@ def test_a_curve_that_grows_is_placed_anew_from_its_last_cone_but_one() -> None:
     assert np.abs(boundary.evaluate(points, last) - straight).max() > 0.05
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.lists(st.tuples(st.floats(2.0, 6.0), st.floats(-0.3, 0.3)), min_size=3, max_size=6))
 def test_growth_reaches_for_the_cones_and_keeps_what_was_confirmed(steps: list[tuple[float, float]]) -> None:
     """Cone by cone along a bending line; before the confirmed end the curve may not change."""
@@ -195,7 +195,7 @@ def test_a_foot_point_is_found_in_its_own_stretch() -> None:
     assert foot.interior.all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.floats(2.0, 40.0), st.floats(-1.5, 1.5))
 def test_a_refined_foot_point_is_perpendicular(u: float, side: float) -> None:
     boundary, points = u_turn()

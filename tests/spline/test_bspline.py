@@ -47,7 +47,6 @@ def inside(spline: BSpline, count: int = 200) -> Array:
     return np.linspace(*spline.domain, count)
 
 
-@settings(max_examples=60, deadline=None)
 @given(spline=open_splines())
 def test_values_derivatives_and_matrix_are_scipys(spline: BSpline) -> None:
     u, steps = inside(spline), np.diff(spline.knots)
@@ -76,7 +75,6 @@ def test_periodic_curve_is_scipys_and_closes_smoothly(degree: int) -> None:
     assert spline.size == 20
 
 
-@settings(max_examples=60, deadline=None)
 @given(spline=open_splines())
 def test_clamping_and_unclamping_leave_the_curve_as_it_is(spline: BSpline) -> None:
     u = inside(spline)
@@ -91,7 +89,6 @@ def test_clamping_and_unclamping_leave_the_curve_as_it_is(spline: BSpline) -> No
     np.testing.assert_allclose(again.control_points, clamped.control_points, atol=100 * scale)
 
 
-@settings(max_examples=80, deadline=None)
 @given(spline=open_splines(), distance=st.floats(1.0, 5.0), angle=st.floats(-2.0, 2.0))
 def test_extension_keeps_the_old_curve_and_meets_the_point(
     spline: BSpline, distance: float, angle: float
@@ -178,7 +175,7 @@ def test_curvature_length_and_foot_points_of_a_circle() -> None:
     assert feet.interior.all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(spline=open_splines())
 def test_arc_length_is_that_of_a_fine_polygon_and_its_inverse_is_one(spline: BSpline) -> None:
     u = inside(spline, 4001)

@@ -12,7 +12,8 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.boundary import boundaries_cross
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.planning import CentreLine, centre_line
+from pathspace_graph.spline.centre_line import CentreCurve, find_line
+from pathspace_graph.spline.planning import CentreLine, _sigmas, centre_line
 from pathspace_graph.spline.planning import _uncrossed as uncrossed
 
 from ..scenes.maps import circle
@@ -139,6 +140,31 @@ def test_sigmas_of_circles_by_hand() -> None:
     assert line.heading_sigma == pytest.approx(0.0, abs=1e-6)
     assert line.arc_length_sigma == pytest.approx(0.2 / 20.0 * line.arc_length, abs=1e-3)
     assert line.length_sigma == pytest.approx(0.2 * 2 * np.pi, abs=1e-3)
+
+
+def test_the_heading_is_that_where_a_line_that_also_slides_crosses_its_old_normals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A line hardly slides when boundaries move, so any derivatives by them stand for the real ones."""
+    line, rng = find_line(wavy(18.0, 24, True, 1), wavy(22.0, 27, True, 2)), np.random.default_rng(4)
+    by_boundaries = rng.normal(size=(3 * line.ribbon.size, 2 * line.size))
+    monkeypatch.setattr(CentreCurve, "by_boundaries", by_boundaries)
+    change, centre, step = rng.normal(size=2 * line.size), line.ribbon.centre, 1e-6
+    u = np.linspace(*centre.domain, 50)
+    _, heading_sigma, *_ = _sigmas(line, u, line.crossings(u), np.outer(change, change))
+    by_line = (by_boundaries @ change).reshape(centre.distinct_control_points.shape[0], -1)[:, :2]
+    points, tangent = centre.evaluate(u), centre.tangent_unit(u)
+    heading = []
+    for h in (step, -step):
+        moved_line, v = centre.with_points(centre.distinct_control_points + h * by_line), u
+        for _ in range(5):
+            off = ((moved_line.evaluate(v) - points) * tangent).sum(axis=1)
+            v = v - off / (moved_line.evaluate(v, 1) * tangent).sum(axis=1)
+        turned = moved_line.tangent_unit(v)
+        heading.append(tangent[:, 0] * turned[:, 1] - tangent[:, 1] * turned[:, 0])
+    np.testing.assert_allclose(
+        heading_sigma, np.abs(heading[0] - heading[1]) / (2.0 * step), rtol=1e-4, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("closed", [True, False])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pathspace_graph.errors import SettingsError
@@ -80,7 +80,6 @@ def test_a_kink_does_not_draw_all_knots() -> None:
     assert np.diff(breaks).max() < 7.0
 
 
-@settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), baseline=st.floats(0.0, 1.0), count=st.integers(1, 40))
 def test_breaks_never_decrease_and_keep_both_ends(seed: int, baseline: float, count: int) -> None:
     spline = ring(9, seed)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -97,7 +97,6 @@ curvatures = st.lists(st.floats(-0.5, 0.5), min_size=4, max_size=60).map(np.arra
 
 
 @given(curvatures, st.integers(0, 59))
-@settings(max_examples=60, deadline=None)
 def test_a_loop_has_the_same_profile_wherever_it_begins(curvature: Array, shift: int) -> None:
     profile = speed_profile(loop(curvature, 0.7), CAR)
     rolled = speed_profile(loop(np.roll(curvature, shift), 0.7), CAR)
@@ -107,7 +106,6 @@ def test_a_loop_has_the_same_profile_wherever_it_begins(curvature: Array, shift:
 
 
 @given(curvatures, st.booleans())
-@settings(max_examples=60, deadline=None)
 def test_each_step_obeys_the_friction_ellipse_at_its_slower_end(curvature: Array, closed: bool) -> None:
     line = (loop if closed else open_line)(curvature, 0.7)
     profile = speed_profile(line, CAR)

@@ -1,4 +1,4 @@
-"""Tentative tracks and constellations of cones in numpy."""
+"""Cones laid on earlier ones in numpy (`_kernels:laid`)."""
 
 from __future__ import annotations
 
@@ -6,54 +6,11 @@ from typing import Final
 
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import left_of, rotation, wrap_angle
 from pathspace_graph.mapping.constellation import Cones
-from pathspace_graph.mapping.tentative import nearest_within
 
-Tracks = tuple[Array, Array, IntArray, Array]
 GATES: Final = (4.0, 4.0, 2.0, 1.0, 1.0, 1.0)  # factors of the cap in the steps of the refinement
-
-
-def merged(
-    known: Tracks, points: Array, covariances: Array, t: float, gate: tuple[float, float, float]
-) -> Tracks:
-    """Return the columns of tracks with detections added as `TentativeTracks.add` does."""
-    radius, most, chi = gate
-    places, inform, counts, last_t = known[0].copy(), known[1].copy(), known[2].copy(), known[3].copy()
-    information = np.linalg.inv(covariances)
-    nearest, near = nearest_within(points, places, radius)
-    offset = points[:, None] - places
-    i, j = np.nonzero(~near[:, None] & ((offset**2).sum(axis=2) < (most * radius) ** 2))
-    if len(i):
-        square, off = np.full(offset.shape[:2], np.inf), offset[i, j]
-        joint = covariances[i] + np.linalg.inv(inform[j])
-        square[i, j] = (off * np.linalg.solve(joint, off[:, :, None])[:, :, 0]).sum(axis=1)
-        smeared = square.min(axis=1) < chi**2
-        nearest[smeared], near[smeared] = square.argmin(axis=1)[smeared], True
-    for row in np.flatnonzero(near):
-        track, weight = nearest[row], information[row]
-        inform[track] += weight
-        places[track] += np.linalg.solve(inform[track], weight @ (points[row] - places[track]))
-        counts[track] += 1
-        last_t[track] = max(last_t[track], t)  # a late detection makes no track older
-    new = int((~near).sum())
-    return (
-        np.concatenate([places, points[~near]]),
-        np.concatenate([inform, information[~near]]),
-        np.concatenate([counts, np.ones(new, np.intp)]),
-        np.concatenate([last_t, np.full(new, t)]),
-    )
-
-
-def merged_in_turn(points: Array, covariances: Array, gate: tuple[float, float, float]) -> Tracks:
-    """Return the columns of tracks to which detections (m, 2) are added one after another."""
-    tracks: Tracks = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp), np.zeros(0))
-    for k in range(len(points)):
-        tracks = merged(tracks, points[k : k + 1], covariances[k : k + 1], 0.0, gate)
-    return tracks
-
-
 REGULAR: Final = (1e-2, 1e-2, 1.0)  # information added in a step, so that few cones still give one
 
 
