@@ -34,6 +34,15 @@ def test_a_way_is_laid_on_the_loop_where_it_belongs() -> None:
     np.testing.assert_allclose(found[0], motion, atol=1e-9)
 
 
+def test_the_places_of_a_way_are_apart() -> None:
+    """A loop that is the same after half a turn has two, and no neighbours of the better one."""
+    phi = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
+    loop = (20.0 + 6.0 * np.cos(2.0 * phi))[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
+    way = loop[20:55]
+    first, second = (move_points(motion, way) for motion in beside(loop, way)[:2])
+    np.testing.assert_allclose(first, -second, atol=1e-9)
+
+
 @pytest.mark.parametrize("begin", [0.0, 4.0, 9.0])
 def test_a_drive_is_placed_wherever_it_began(begin: float) -> None:
     motion = find_place(driven_alone(lap(0)), driven_alone(lap(1, begin)))
