@@ -96,8 +96,6 @@ class RayNoise:
 class TwistNoise:
     """Noise of a measured twist: white noise of each reading, and a drift that lasts for many of them."""
 
-    LENGTHS: ClassVar = {"white": (1, 1, 0), "drift": (1, 1, 0)}
-
     white: Array  # (3,) standard deviation of a single twist (m/s, m/s, rad/s)
     drift: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) Random walk of the integrated pose (m, m and rad by root of s)."""
