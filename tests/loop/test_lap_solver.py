@@ -1,4 +1,4 @@
-"""The schedule of the batches: when a lap is due, how long a cycle waits, and what a replay repeats."""
+"""The schedule of the batches: when a lap is due, how long a cycle waits, and the rest after a failure."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ import pytest
 from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.batch.optimizer import Convergence
 from pathspace_graph.loop import worker
+from pathspace_graph.loop.drive import Drive
 from pathspace_graph.loop.lap_solver import LapSolver
+from pathspace_graph.mapping.road import Road
 from pathspace_graph.settings.mapper import MapperSettings, OpenLapSettings
 
 PERIOD = 0.1
@@ -119,3 +121,18 @@ def test_the_slowest_batch_counts(sent: list[Lap]) -> None:
         assert outcome(one, 360 - 270 + first, first) is not None
         late.append(one.late_cycles)
     assert late == [30, 30, 30]
+
+
+def test_a_drive_gives_up_its_batch_and_rests_for_ten_metres(monkeypatch: pytest.MonkeyPatch) -> None:
+    road, drive, given_up = Road(MapperSettings()), Drive(MapperSettings()), list[int]()
+    monkeypatch.setattr(drive.solver, "give_up", given_up.append)
+    for x in (0.0, 1.0):
+        road.path.update(np.array([x, 0.0, 0.0]))
+    assert not drive.rests(road)
+    drive.rest(road)
+    assert given_up == [road.next_cycle]
+    rests = {}
+    for x in (1.5, 10.9, 11.1):
+        road.path.update(np.array([x, 0.0, 0.0]))
+        rests[x] = drive.rests(road)
+    assert rests == {1.5: True, 10.9: True, 11.1: False}
