@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.front_end.motion import MotionCheck
-from pathspace_graph.front_end.scan_matching import MOST_MISFIT
 from pathspace_graph.front_end.standstill import Standstill
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT
@@ -178,13 +177,8 @@ def test_detections_before_other_noise_are_not_compared() -> None:
         assert not any(is_rest(motion) for motion in later)
 
 
-def test_an_odometry_that_is_always_believed_is_believed_here() -> None:
-    true, check = np.zeros(20), MotionCheck(TwistNoise(TWIST_SIGMA), MotionSettings(doubt=np.inf))
-    assert not any(motion.fault for motion in motions(true, true + 1.3, 0, check=check))
-
-
-# --- the likelihood, written out -------------------------------------------------------------------------
-
+GAIN = 9.0
+"""Gain of a detection that matches exactly."""
 PLACES = np.column_stack([np.linspace(1.0, 6.0, 10), np.tile([-1.8, 1.8], 5)])
 """Ten cones, none of which a motion of 0.7 or 1.4 m along x, or a part of it, moves onto another one."""
 
@@ -201,7 +195,7 @@ def test_three_cycles_count_as_two_thirds_of_their_three_pairs() -> None:
     """Ten cones match exactly in three pairs of cycles, where by odometry none of them does."""
     far = np.array([[30.0, 0.0]])  # so that the others are in view
     points, step = np.concatenate([PLACES, far]), np.array([1.3, 0.0, 0.0])
-    twice = 2.0 / 3.0 * 3.0 * 10.0 * MOST_MISFIT
+    twice = 2.0 / 3.0 * 3.0 * 10.0 * GAIN
     assert stands(points, 3, step).place(np.sqrt(0.98 * twice)) is not None
     assert stands(points, 3, step).place(np.sqrt(1.02 * twice)) is None
 
@@ -211,5 +205,10 @@ def test_only_what_the_other_cycle_could_see_says_that_the_vehicle_stands() -> N
     step, ranges = np.array([1.3, 0.0, 0.0]), np.hypot(*PLACES.T)
     once, twice = ((ranges <= ranges.max() - k * 1.3).sum() for k in (1, 2))
     assert 10 > once > twice > 0
-    likelier = 2.0 / 3.0 * (2 * once + twice) * MOST_MISFIT
+    likelier = 2.0 / 3.0 * (2 * once + twice) * GAIN
     assert stands(PLACES, 3, step).place(np.sqrt(1.02 * likelier)) is None
+
+
+def test_an_odometry_that_is_always_believed_is_believed_here() -> None:
+    true, check = np.zeros(20), MotionCheck(TwistNoise(TWIST_SIGMA), MotionSettings(doubt=np.inf))
+    assert not any(motion.fault for motion in motions(true, true + 1.3, 0, check=check))
