@@ -17,6 +17,7 @@ from pathspace_graph.batch.simplification import map_block, simplified
 from pathspace_graph.batch.stations import SHIFT_BLOCK, SeenAgain, laps_of, match_stations, shifts
 from pathspace_graph.batch.system import SIGMA_SLIDE, BatchSystem, Evaluation, moved
 from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.graph.drives import Drives
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.stations import CurveStations
@@ -71,6 +72,19 @@ def test_both_boundaries_tell_the_shift_together() -> None:
     np.testing.assert_allclose(shifts(rows)[int(LENGTH / SHIFT_BLOCK) :], 1.4, atol=0.11)
 
 
+def test_a_cone_counts_once_however_often_it_is_seen() -> None:
+    """One that was moved by 1.2 m since the first lap, and is seen a thousand times, shifts nothing."""
+    curve = row(3.0, JITTER)
+    seen = seen_again(curve, 0.0)
+    at = len(seen.rows) // 2
+    u, block = (
+        np.append(seen.u, np.full(1000, seen.u[at] - 1.2)),
+        np.append(seen.block, [seen.block[at]] * 1000),
+    )
+    many = SeenAgain(curve, np.arange(len(u)), u, np.full(len(u), 0.1), block)
+    np.testing.assert_allclose(shifts([many])[int(LENGTH / SHIFT_BLOCK) :], 0.0, atol=0.11)
+
+
 def test_nothing_seen_again_has_no_shift() -> None:
     first = seen_again(row(3.0, JITTER), 0.0)
     assert len(shifts([replace(first, block=np.full(len(first.rows), -1))])) == 0
@@ -119,6 +133,20 @@ def test_detections_of_both_passes_are_of_one_cone(off: float) -> None:
     cone = true_cones(system, found.rows)
     for station in np.unique(found.station):
         assert len(np.unique(cone[found.station == station])) == 1
+
+
+def test_no_stretch_of_one_drive_is_next_to_one_of_another() -> None:
+    """The end of one drive says nothing of the shift at the beginning of the next."""
+    system, at, _ = optimum()
+    state, detections = at.state.copy(), system.detections
+    label, cut = LEFT, len(at.state.poses) - 10
+    curve = CurveStations.of(label, 0, np.arange(5.0), np.full(5, 0.02), (0.0, LENGTH))
+    state.drives = Drives((0, cut), (0, 0))
+    seen = SeenAgain.of(state, detections, curve)
+    is_second = detections.cycle[seen.rows] >= cut
+    again = seen.block >= 0
+    first, second = seen.block[again & ~is_second], seen.block[again & is_second]
+    assert second.min() >= first.max() + 3
 
 
 def test_the_gradient_is_that_of_the_cost() -> None:

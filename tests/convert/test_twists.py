@@ -361,6 +361,28 @@ def test_the_noise_of_interpolated_twists_is_that_of_the_samples() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
+def test_interpolated_twists_move_the_vehicle_better_than_held_ones(seed: int, tmp_path: Path) -> None:
+    """From second to second, relative to all twists; over a lap the errors of either cancel by chance."""
+    log, errors = drive(seed), list[np.ndarray]()
+    source = write(tmp_path, log, table(log, 10))
+    begin, end = log.odometry.t[0], log.odometry.t[-11]
+    at = np.arange(begin, end, 1.0)
+    expected = driven(log.odometry, at)
+    for options in ((), ("--held",)):
+        odometry = read_log(convert(source, *options)).odometry
+        errors.append(driven(odometry, at - begin + odometry.t[0]) - expected)
+    interpolated, held = (np.sqrt(np.square(one).mean(axis=0)) for one in errors)
+    assert interpolated[0] < 0.7 * held[0]  # that of vy is noise, whichever way
+    assert interpolated[2] < 0.5 * held[2]
+
+
+def driven(odometry: Odometry, t: np.ndarray) -> np.ndarray:
+    """Integrals (k - 1, 3) of the twists from each of some times (k,) to the next."""
+    sums = np.vstack([np.zeros(3), np.cumsum(np.diff(odometry.t)[:, None] * odometry.twist[:-1], axis=0)])
+    return np.diff(np.column_stack([np.interp(t, odometry.t, column) for column in sums.T]), axis=0)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
 def test_an_odometry_of_five_hertz_maps_the_first_lap(seed: int, tmp_path: Path) -> None:
     log = drive(seed)
     out = convert(write(tmp_path, log, table(log, 10)))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.front_end.log_odometry import half_square, sensor_prior
+from pathspace_graph.front_end.log_odometry import chained, half_square, sensor_prior
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, control_keys, pose_keys
-from pathspace_graph.settings.online import CalibrationSettings
+from pathspace_graph.io.log import Odometry
+from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry
+from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
 
 KNOWN, ESTIMATED = CalibrationSettings(sensor=False), CalibrationSettings()
 
@@ -51,3 +53,13 @@ def test_a_sensor_that_is_known_has_no_prior() -> None:
     assert sensor_prior(variables, KNOWN) == []
     assert half_square(sensor_prior(variables, KNOWN)) == 0.0
     np.testing.assert_array_equal(variables.calibration_keys, [CALIBRATION_KEY])
+
+
+def test_the_first_pose_is_as_uncertain_as_the_start_and_the_odometry_since() -> None:
+    """It stands for 2 s until its first cycle, by a twist with sigmas of 3 m/s, 1 m/s and 0.5 rad/s."""
+    odometry = Odometry(np.zeros(1), np.zeros((1, 3)))
+    step = integrate_odometry(odometry, 2.0, np.array([3.0, 1.0, 0.5]))
+    settings = OdometrySettings()
+    chain = chained([2.0], [MeasuredMotion(step, odometry.twist)], settings)
+    variances = np.square(settings.sigmas_start) + np.array([36.0, 4.0, 1.0])
+    np.testing.assert_allclose(np.linalg.inv(chain.first_information), np.diag(variances), rtol=1e-6)

@@ -14,6 +14,8 @@ from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.sightings import (
     FOLLOW_RANGE,
     MIN_TWISTS,
+    MOST_PARTS,
+    MOST_TWISTS,
     ConeTracker,
     SeenCycle,
     Sightings,
@@ -94,6 +96,31 @@ def test_few_twists_say_nothing() -> None:
     assert recorded(t[:-1], twists[:-1]).white() is None
     assert recorded(t, twists).white() is not None
     assert recorded(t, np.tile(twists[0], (len(t), 1))).white() is None
+
+
+def test_the_order_of_least_noise_counts_where_the_motion_is_fast() -> None:
+    """Second differences of a sine of 0.3 rad a sample are ten times the noise, fourth ones are below it."""
+    twists = 0.5 * np.sin(0.3 * np.arange(2000))[:, None] + [8.0, 0.0, 0.0]
+    twists += 0.002 * np.random.default_rng(0).normal(size=(2000, 3))
+    record = recorded(np.arange(2000) / 40.0, twists)
+    orders, found = record.orders(), record.white()
+    assert orders is not None and found is not None
+    assert (orders[0] > 4.0 * orders[2]).all()
+    np.testing.assert_allclose(found[0], 0.002, rtol=0.25)
+
+
+def test_a_long_drive_keeps_the_newest_twists_alone() -> None:
+    count = 2 * MOST_TWISTS
+    t, twists = noisy_twists(40.0, count, 6)
+    twists[: count // 2] += np.random.default_rng(7).normal(size=(count // 2, 3))  # a rough road before
+    record = TwistRecord()
+    for begin in range(0, count, 20):
+        record.add(Odometry(t[begin : begin + 20], twists[begin : begin + 20]))
+    assert len(record._parts) <= MOST_PARTS
+    assert sum(len(part.t) for part in record._parts) <= MOST_TWISTS + 20 * MOST_PARTS
+    found = record.white()
+    assert found is not None
+    np.testing.assert_allclose(found[0], WHITE, rtol=0.15)
 
 
 # --- cones that are followed -----------------------------------------------------------------------------
@@ -218,3 +245,13 @@ def test_the_derivative_by_the_bias_of_the_yaw_rate_is_the_numeric_one() -> None
     numeric = (poses(h) - poses(-h))[:n] / (2.0 * h)
     np.testing.assert_allclose(found.by_bias[:, 2], numeric[:, 2], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(found.by_bias, numeric, atol=2e-3 * np.abs(numeric).max())
+
+
+def test_cones_are_followed_the_same_cycle_by_cycle() -> None:
+    """Numbers and derivatives go on from the cycles before."""
+    cones = np.array([[8.0, 2.0], [14.0, -2.0], [21.0, 2.5], [27.0, -1.0]])
+    cycles = drive((8.0, 0.2, 0.3), 20, cones)
+    whole, tracker = follow(cycles, NO_ERRORS), ConeTracker(NO_ERRORS)
+    parts = Sightings.stacked([tracker.follow(cycles[k : k + 3]) for k in range(0, 20, 3)])
+    for column in ("cone", "t", "point", "twist", "pose", "by_bias"):
+        np.testing.assert_allclose(getattr(parts, column), getattr(whole, column), atol=1e-12)

@@ -177,6 +177,38 @@ def test_detections_before_other_noise_are_not_compared() -> None:
         assert not any(is_rest(motion) for motion in later)
 
 
+GAIN = 9.0
+"""Gain of a detection that matches exactly."""
+PLACES = np.column_stack([np.linspace(1.0, 6.0, 10), np.tile([-1.8, 1.8], 5)])
+"""Ten cones, none of which a motion of 0.7 or 1.4 m along x, or a part of it, moves onto another one."""
+
+
+def stands(points: Array, cycles: int, odometry: Array) -> Standstill:
+    """A vehicle that sees the same points in each cycle, half a second apart, while its odometry moves."""
+    standstill, covariances = Standstill(), np.tile(1e-4 * np.eye(2), (len(points), 1, 1))
+    for k in range(cycles):
+        standstill.add(0.5 * k, points, covariances, odometry if k else np.zeros(3))
+    return standstill
+
+
+def test_three_cycles_count_as_two_thirds_of_their_three_pairs() -> None:
+    """Ten cones match exactly in three pairs of cycles, where by odometry none of them does."""
+    far = np.array([[30.0, 0.0]])  # so that the others are in view
+    points, step = np.concatenate([PLACES, far]), np.array([1.3, 0.0, 0.0])
+    twice = 2.0 / 3.0 * 3.0 * 10.0 * GAIN
+    assert stands(points, 3, step).place(np.sqrt(0.98 * twice)) is not None
+    assert stands(points, 3, step).place(np.sqrt(1.02 * twice)) is None
+
+
+def test_only_what_the_other_cycle_could_see_says_that_the_vehicle_stands() -> None:
+    """By an odometry of 1.3 m a cycle, the last cones were beyond the view of one or two cycles before."""
+    step, ranges = np.array([1.3, 0.0, 0.0]), np.hypot(*PLACES.T)
+    once, twice = ((ranges <= ranges.max() - k * 1.3).sum() for k in (1, 2))
+    assert 10 > once > twice > 0
+    likelier = 2.0 / 3.0 * (2 * once + twice) * GAIN
+    assert stands(PLACES, 3, step).place(np.sqrt(1.02 * likelier)) is None
+
+
 def test_an_odometry_that_is_always_believed_is_believed_here() -> None:
     true, check = np.zeros(20), MotionCheck(TwistNoise(TWIST_SIGMA), MotionSettings(doubt=np.inf))
     assert not any(motion.fault for motion in motions(true, true + 1.3, 0, check=check))

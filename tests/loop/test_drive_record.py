@@ -78,6 +78,17 @@ def test_the_chain_of_the_lap_is_the_odometry_that_was_measured() -> None:
     np.testing.assert_allclose(poses[-1, :2], on_circle(np.array([angle]))[0], atol=1e-6)
 
 
+def test_the_heading_of_replaced_poses_does_not_jump() -> None:
+    """A batch may hand back wrapped ones; means and steps of headings need a continuous turn."""
+    record = driven(1.1, 0.0)
+    wrapped = record.poses.copy()
+    wrapped[:, 2] = wrap_angle(wrapped[:, 2])
+    assert np.abs(np.diff(wrapped[:, 2])).max() > 6.0
+    record.replaced(wrapped)
+    for poses in (record.poses, record.corrected):
+        np.testing.assert_allclose(np.diff(poses[:, 2]), SPEED * CYCLE / RADIUS, atol=1e-9)
+
+
 # --- poses in the closed map -----------------------------------------------------------------------------
 
 

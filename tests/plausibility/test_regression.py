@@ -63,14 +63,22 @@ def test_too_few_cones_tell_no_motion() -> None:
     assert register(few, few, STILL, 6.0, 3)[0] == 1.0
 
 
-def test_the_motions_of_a_log_do_not_depend_on_its_odometry() -> None:
+@pytest.mark.parametrize("seed", range(3))
+def test_the_motions_of_a_log_do_not_depend_on_its_odometry(seed: int) -> None:
+    """Between cycles 0.4 s apart a row may be registered a cone too far, which is 10 m/s at 4 m."""
     log = short_drive()
-    noise = np.random.default_rng(0).normal(0.0, (20.0, 20.0, 2.0), log.odometry.twist.shape)
+    noise = np.random.default_rng(seed).normal(0.0, (20.0, 20.0, 2.0), log.odometry.twist.shape)
     alone, wrong = motions_of(log), motions_of(with_twists_of(log, noise))
     assert len(wrong.rate) > 0.8 * len(alone.rate)
     v, w = Regression(log.odometry, wrong).stated("twist", 0.0)
-    assert (np.abs(wrong.velocity - v) < 2.5).mean() > 0.75
-    assert (np.abs(wrong.rate - w) < 0.4).mean() > 0.85
+    near = wrong.end - wrong.begin < 0.3
+    assert near.sum() > 0.6 * len(near)
+    for right, least, least_near in (
+        (np.abs(wrong.velocity - v) < 2.5, 0.75, 0.85),
+        (np.abs(wrong.rate - w) < 0.4, 0.85, 0.85),
+    ):
+        assert right.mean() > least
+        assert right[near].mean() > least_near
 
 
 def test_a_log_without_detections_has_no_motions() -> None:
@@ -95,7 +103,7 @@ def moved(fit: Fit, odometry: Odometry = ODOMETRY, noise: float = 0.0) -> Regres
     return Regression(odometry, replace(empty, velocity=v, rate=w))
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(
     st.floats(0.01, 50.0),
     st.floats(-3.1, 3.1),

@@ -11,7 +11,13 @@ from scipy import stats
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.sim.sensor import ConeSensor, OdometryNoise, SensorSettings, measure_twists
+from pathspace_graph.sim.sensor import (
+    ConeSensor,
+    OdometryNoise,
+    SensorSettings,
+    gauss_markov,
+    measure_twists,
+)
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import generate_track
@@ -236,3 +242,8 @@ def test_bad_settings(track: Track) -> None:
         SimulationSettings(laps=0)
     with pytest.raises(SettingsError, match="seed"):
         simulate(track, SimulationSettings(), -1)
+
+
+def test_a_slow_error_has_its_size_from_the_first_reading_on() -> None:
+    drawn = gauss_markov((50, 20_000), 0.02, np.random.default_rng(0))
+    np.testing.assert_allclose(drawn[[0, 1, 10, 49]].std(axis=1), 1.0, rtol=0.03)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,48 @@ def test_the_rows_are_the_derivatives_of_every_drives_residuals() -> None:
             assert changed.residual[k] == pytest.approx(expected, abs=1e-6 * (1.0 + abs(expected)))
     keys = {int(key) for rows in before for key in np.unique(rows.keys)}
     assert keys >= {CALIBRATION_KEY, CALIBRATION_KEY + 2, SENSOR_KEY, SENSOR_KEY + 2}
+
+
+def test_odometry_of_two_drives_is_in_one_factor_only_where_they_meet() -> None:
+    """A factor across two groups of poses takes twice the time."""
+    system = JointSystem(placed("", ""))
+    rows = system.drive_rows(joint_state(system, system.placed[0]))
+    odometry = [one.owner for one in rows if one.keys.shape[1] == 3]
+    assert len(odometry) == 2
+    assert len(np.intersect1d(*odometry)) <= 1
+
+
+def test_wider_priors_of_one_drive_are_those_of_its_calibrations_alone() -> None:
+    system = JointSystem(placed("", ""))
+    state = joint_state(system, system.placed[0])
+    before = system.drive_rows(state)
+    settings = system.placed[1].settings
+    odometry, sensor = settings.odometry, settings.calibration
+    wide = replace(
+        settings,
+        odometry=replace(
+            odometry, sigma_scale=2.0 * odometry.sigma_scale, sigma_bias=2.0 * odometry.sigma_bias
+        ),
+        calibration=replace(sensor, sigma_yaw=2.0 * sensor.sigma_yaw),
+    )
+    system.widen_priors(1, wide)
+    for old, new in zip(before, system.drive_rows(state), strict=True):
+        keys = np.unique(old.keys)
+        ratio = np.ones(len(old.residual))
+        if np.array_equal(keys, [CALIBRATION_KEY + 1]) and len(ratio) == 2:
+            ratio[:] = 2.0
+        elif np.array_equal(keys, [SENSOR_KEY + 1]):
+            ratio[0] = 2.0
+        np.testing.assert_allclose(ratio[:, None] * new.jacobian, old.jacobian, rtol=1e-12)
+
+
+def test_the_sensor_of_a_vehicle_begins_at_the_mean_of_its_drives() -> None:
+    one, other = alone(lap(0)), alone(lap(1, 9.0))
+    drives = [PlacedDrive(str(k), result, np.zeros(3), "red") for k, result in enumerate((one, other))]
+    sensors = [result.optimum.state.variables.sensor for result in (one, other)]
+    assert np.abs(sensors[0] - sensors[1]).max() > 1e-4
+    state = joint_state(JointSystem(drives), drives[0])
+    np.testing.assert_allclose(state.variables.sensor, 0.5 * (sensors[0] + sensors[1]))
 
 
 def test_only_the_first_drive_has_a_first_pose() -> None:
