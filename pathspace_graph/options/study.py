@@ -115,7 +115,7 @@ class Report(Command):
 
     The experiments are `accuracy`, `skidpad`, `camera`, `faults`, `hard`, `lines`, `endurance`, `centerline`,
     the ablations `stations`, `gauge`, `robust`, `density`, `lag`, `relinearize`, `degree` and `covariance`,
-    and `hints`, `known`, `joint`, `speed`, `scale` and, with logs, `real`. Each row of a table says by which
+    and `known`, `joint`, `speed`, `scale` and, with logs, `real`. Each row of a table says by which
     command, at which commit, on which machine and when it was measured.
     """
 
