@@ -161,12 +161,10 @@ def results_table(
         rows |= {name: [getattr(one, name) for one in column] for name in names}
         rows[metric.heading] = [_mean(metric, one.value) for one in column]
         sign = (metric.key in LOWER) - (metric.key in HIGHER)
-        of = {noise: [sign * c.value.mean for c in column if c.noise == noise] for noise in study.noises}
-        best[metric.heading] = [
-            bool(sign and len({*of[one.noise]} - {np.nan}) > 1)
-            and sign * one.value.mean <= np.nanmin(of[one.noise])
-            for one in column
-        ]
+        means = pd.Series([sign * one.value.mean for one in column])
+        of_noise = means.groupby([one.noise for one in column])
+        differs = (of_noise.transform("nunique") > 1) & bool(sign)
+        best[metric.heading] = (differs & (means == of_noise.transform("min"))).tolist()
     texts = pd.DataFrame(rows)
     title = f"{_about(study)} Mean and {_interval(frame)}{_laps(study)}."
     bold = pd.DataFrame(best).reindex(columns=texts.columns, fill_value=False)

@@ -96,7 +96,7 @@ def test_a_failure_is_told_and_the_rest_goes_on(folder: Path, tmp_path: Path) ->
         ("b", "broken", "ValueError: lost the way"),
     ]
     assert told == [0, 1, 2, 3, 4] and len(found.frame) == 6
-    assert set(found.times()["stage"]) == {"whole", "guess"}
+    assert set(found.times["stage"]) == {"whole", "guess"}
     table = paper_table(found)
     assert [*table.frame.iloc[0, :2]] == ["broken", "failed"]
 

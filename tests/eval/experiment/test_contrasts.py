@@ -10,10 +10,9 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from pathspace_graph.eval.experiment.run import add_batch
-from pathspace_graph.eval.experiment.statistics import RUN, contrasts
 from pathspace_graph.eval.experiment.plots import plot_differences
-from pathspace_graph.eval.experiment.statistics import paired_p
+from pathspace_graph.eval.experiment.run import add_batch
+from pathspace_graph.eval.experiment.statistics import RUN, contrasts, paired_p
 from pathspace_graph.eval.experiment.study import Baseline, Study
 from pathspace_graph.eval.experiment.tables import caption, joined, summary_tables
 from pathspace_graph.eval.figures.style import Picture
