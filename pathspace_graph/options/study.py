@@ -92,8 +92,7 @@ class Scale(Estimation, FolderCommand):
     """Time every online estimator on ever larger maps and more and more detections, and draw the slopes.
 
     All run in this one process, cycle for cycle in turn, so that other work of the machine slows all of them
-    alike. An estimator that takes longer than the budget is stopped there, and the table says so. Memory is
-    measured by tracemalloc, for Python and numpy, while the first lap of the closed road is mapped. Finished
+    alike. An estimator that takes longer than the budget is stopped there, and the table says so. Finished
     sweeps are kept in `OUT.unfinished` until all are there, so that the same command goes on where it was
     killed.
     """

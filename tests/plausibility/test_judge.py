@@ -13,9 +13,9 @@ from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.plausibility.judge import positions_in_metres
 
 from ..scenes.drives import ahead, corridor, detections, exact_log, short_drive
-from ..scenes.good_logs import EDITED, PRESET, SIMULATED, good_log
 from ..scenes.lines import line_drive
-from ..scenes.mistakes import MISTAKES, causes_of, in_frame, late, with_points, with_twists
+from .good_logs import EDITED, PRESET, SIMULATED, good_log
+from .mistakes import MISTAKES, causes_of, in_frame, late, with_points, with_twists
 
 SAID = {
     "positions in millimetres": ("in millimetres", "multiply x and y by 0.001"),

@@ -17,7 +17,7 @@ from pathspace_graph.plausibility.judge import read_plausible_log, refused_hints
 from pathspace_graph.settings.online import LimitSettings
 
 from ..scenes.drives import short_drive
-from ..scenes.mistakes import MISTAKES
+from .mistakes import MISTAKES
 
 
 def written(log: Log, folder: Path) -> Path:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..plausibility.mistakes import MISTAKES, dead_reckoned, detections_in_the_map, in_frame, late
 from ..scenes.batch import course_log
-from ..scenes.mistakes import MISTAKES, dead_reckoned, detections_in_the_map, in_frame, late
 
 LOG = course_log(0.5)
 
