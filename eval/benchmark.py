@@ -509,10 +509,12 @@ def measure_scaling(
 def scaling_table(scaling: Scaling) -> Table:
     """Return a row for each estimator: slopes with standard errors, times, the ratio to the first."""
     settings, first = scaling.settings, scaling.estimators[0]
+    shown = [*dict.fromkeys((2, settings.laps))]
     header = (
         *("estimator", f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})", "slope, readings"),
         *(f"ms at {COMPARED_AT:g} cones", f"{first} / this", "most cones"),
-        *("ms, lap 2", f"ms, lap {settings.laps}", f"ms, {LINE_POINTS} points of lines"),
+        *(f"ms, lap {lap}" for lap in shown),
+        f"ms, {LINE_POINTS} points of lines",
     )
     rows = []
     for name in scaling.estimators:
@@ -520,9 +522,9 @@ def scaling_table(scaling: Scaling) -> Table:
         both = (figure(slope["slope"], slope["error"], 2) for slope in slopes)
         at, laps = scaling.seconds_at(COMPARED_AT, name), scaling.of(LAPS, name).set_index("at")["seconds"]
         alone = [1e3 * at, scaling.seconds_at(COMPARED_AT, first) / at, scaling.of(CONES, name)["at"].max()]
-        alone += [1e3 * laps.get(float(lap), math.nan) for lap in (2, settings.laps)]
+        alone += [1e3 * laps.get(float(lap), math.nan) for lap in shown]
         alone.append(1e3 * scaling.seconds_on_line(name))
-        rows.append((name, *both, *figures(alone, 1, 2, 0, 1, 1, 1)))
+        rows.append((name, *both, *figures(alone, 1, 2, 0, *[1] * len(shown), 1)))
     return Table.of(header, rows, "Time per update: slopes of the logarithms, ± standard error")
 
 

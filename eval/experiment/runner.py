@@ -25,8 +25,10 @@ from pathspace_graph.loop.worker import end_with
 from .drives import identity
 from .provenance import Code, check_code, made
 
-if sys.platform != "win32":
+try:
     import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 R = TypeVar("R")
 W = TypeVar("W")
@@ -188,7 +190,7 @@ def locked(out: Path) -> Iterator[None]:
     """
     out.mkdir(parents=True, exist_ok=True)
     with (out / LOCK).open("a", encoding="utf-8") as file:
-        if sys.platform != "win32":
+        if fcntl is not None:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
