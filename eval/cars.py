@@ -10,7 +10,8 @@ from pathspace_graph.sim.simulate import SimulationSettings
 from pathspace_graph.sim.track import Track
 from pathspace_graph.sim.track_generator import generate_track
 
-from .experiment.tables import Quantity, Table
+from .experiment.statistics import estimate
+from .experiment.tables import Table
 
 Columns = Mapping[str, tuple[str, int, float]]  # of a table, by their key: heading, digits, factor
 
@@ -40,6 +41,6 @@ def over_tracks(title: str, parts: Mapping[str, pd.DataFrame], columns: Columns)
     rows = []
     for label, part in parts.items():
         means = part.groupby("track")[[*columns]].mean()
-        figures = (Quantity.of(means[key], digits, factor) for key, (_, digits, factor) in columns.items())
-        rows.append((label, *figures))
-    return Table((title, *(heading for heading, _, _ in columns.values())), tuple(rows))
+        texts = (estimate(means[key]).text(digits, factor) for key, (_, digits, factor) in columns.items())
+        rows.append((label, *texts))
+    return Table.of((title, *(heading for heading, _, _ in columns.values())), rows)

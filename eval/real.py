@@ -20,14 +20,15 @@ from pathspace_graph.io.map import Map, read_map
 from pathspace_graph.io.results import TRAJECTORY_FILE
 from pathspace_graph.io.tables import read_trajectory
 
-from .experiment.cells import EstimatorCell
-from .experiment.run import make_plan, run_records
+from .experiment.run import EstimatorCell, make_plan, run_records
 from .experiment.runner import Record, run_folder
+from .experiment.statistics import estimate
 from .experiment.study import Study
-from .experiment.tables import Quantity, Table
+from .experiment.tables import Table
 from .joint import solve_alone
 from .metrics.accuracy import crossings
 from .metrics.alignment import aligned_distance, maps_apart
+from .metrics.metric import UNKNOWN, figure, figures
 from .metrics.registration import end_by_registration
 
 RUNS: Final = {  # estimator of each run
@@ -105,8 +106,8 @@ def runs_table(drives: Sequence[RealDrive]) -> Table:
             values += [100.0 * row.get(f"reported_{word}", np.nan) for word in ("degraded", "lost")]
             values.append(row.get("ms_processor", np.nan))
             why = f" (no reference: {drive.registered})" if isinstance(drive.registered, str) else ""
-            rows.append((f"{drive.name}, {name}{why}", *Quantity.row(values, 0, 2, 1, 2, 1, 0, 0, 1, 1, 1)))
-    return Table(header, tuple(rows))
+            rows.append((f"{drive.name}, {name}{why}", *figures(values, 0, 2, 1, 2, 1, 0, 0, 1, 1, 1)))
+    return Table.of(header, rows)
 
 
 def maps_table(drives: Sequence[RealDrive]) -> Table:
@@ -116,8 +117,8 @@ def maps_table(drives: Sequence[RealDrive]) -> Table:
         both = zip(first.maps.values(), second.maps.values(), strict=True)
         apart = [aligned_distance(one, other) for one, other in both]
         if min(apart) < 1.0:
-            rows.append((f"{first.name}, {second.name}", *Quantity.row(apart, 2)))
-    return Table(("maps", *(f"{name} [m]" for name in RUNS)), tuple(rows))
+            rows.append((f"{first.name}, {second.name}", *figures(apart, 2)))
+    return Table.of(("maps", *(f"{name} [m]" for name in RUNS)), rows)
 
 
 def joint_table(drives: Sequence[RealDrive]) -> Table:
@@ -132,9 +133,9 @@ def joint_table(drives: Sequence[RealDrive]) -> Table:
         pose = compose(inverse(joint.frames[drive.name]), own.trajectory[-1])
         ends = drive.off(alone[drive.name].trajectory[-1])[0], drive.off(pose)[0]
         values = [apart["mean"], apart["rms"], apart["p95"], apart["max"], *ends]
-        rows.append((drive.name, *Quantity.row(values, 2)))
+        rows.append((drive.name, *figures(values, 2)))
     apart_by = ("map apart, mean [m]", "rms [m]", "p95 [m]", "largest [m]")
-    return Table(("drive", *apart_by, "end off by, alone [m]", "together [m]"), tuple(rows))
+    return Table.of(("drive", *apart_by, "end off by, alone [m]", "together [m]"), rows)
 
 
 def measured_table(drives: Sequence[RealDrive]) -> Table:
@@ -154,9 +155,9 @@ def measured_table(drives: Sequence[RealDrive]) -> Table:
         errors.append(found.sensor[places] * units)
         halves = 1.96 * found.sensor_sigma[places] * units
         pairs = zip(errors[-1].tolist(), halves.tolist(), strict=True)
-        found_errors = (Quantity(v, h, 1) for v, h in pairs)
-        rows.append((drive.name, *Quantity.row(values, 4, 4, 4, 2, 2, 0, 0), *found_errors))
+        found_errors = (figure(v, h, 1) for v, h in pairs)
+        rows.append((drive.name, *figures(values, 4, 4, 4, 2, 2, 0, 0), *found_errors))
     if len(errors) > 1:
-        means = (Quantity.of(column, 1) for column in np.transpose(errors))
-        rows.append(("all drives", *[Quantity(None)] * 7, *means))
-    return Table(header, tuple(rows))
+        means = (estimate(column).text(1) for column in np.transpose(errors))
+        rows.append(("all drives", *[UNKNOWN] * 7, *means))
+    return Table.of(header, rows)

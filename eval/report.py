@@ -1,8 +1,9 @@
 """The figures of the pages: each experiment measures some tables, which are written as tidy CSV.
 
-An experiment is a study or a benchmark with a folder of its own, from which a stopped report goes on. A table
-is named after its experiment. It has a row for each figure, and says by which command, at which commit, on
-which machine and when it was measured. `docs/hooks.py` shows the files of `docs/figures` on the pages.
+An experiment has a folder of its own, from which a stopped report goes on. Most are studies, which
+`report.toml` lists with their tables; the others are functions here. A table is named after its experiment.
+It has a row for each figure, and says by which command, at which commit, on which machine and when it was
+measured. `docs/hooks.py` shows the files of `docs/figures` on the pages.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,56 +14,28 @@ from typing import Any, Final
 import pandas as pd
 
 from pathspace_graph.errors import SettingsError, check_name
+from pathspace_graph.io.parsing import parse_toml, read_text
 from pathspace_graph.settings.evaluation import ScalingSettings
-from pathspace_graph.sim.mistakes import MISTAKES
 
-from . import hints, joint, known, real, views
-from .benchmark.measurement import figures, measure_drive
-from .benchmark.roads import QUICK, make_drives
-from .benchmark.scaling import measure_scaling, scaling_table
+from . import joint, known, real
+from .benchmark import QUICK, SPEED, make_drives, measure_scaling, scaling_table, speed_of_drive
 from .cars import on_tracks
-from .experiment.drives import Drive, load_tracks
-from .experiment.faults import at_strength, fault_table, kinds, only, outcomes, suite
-from .experiment.frame import write_csv
+from .experiment.drives import Drive
+from .experiment.faults import at_strength, fault_table, kinds, only, outcomes
 from .experiment.provenance import made
-from .experiment.rows import RowsOf, rows_of
-from .experiment.run import run_study
-from .experiment.study import Baseline, Study, find_study, read_study_file
-from .experiment.tables import Quantity, Table
+from .experiment.run import RowsOf, make_plan, rows_of, run_study
+from .experiment.statistics import RUN_OF, estimate, last_laps
+from .experiment.study import Study, find_study, read_study_file
+from .experiment.tables import Table, by_metric, by_name, contrast_table, mean, write_csv
+from .metrics.metric import METRICS, UNKNOWN
 from .metrics.reference import landmark_limit
-from .views import ESTIMATORS, LANDMARKS, ONLINE
 
-ABLATIONS: Final = ("stations", "gauge", "robust", "density", "lag", "relinearize", "degree", "covariance")
-"""Studies of parts of the method, driven by one estimator on generated tracks for two laps."""
-GENERATED: Final = (0, 1, 2)  # seeds of the generated tracks, also of the benchmark
-SPEED: Final = {  # figures of the benchmark: label, and digits
-    "mean_by_isam2": ("mean update relative to iSAM2 with known data association", 2),
-    "p99_by_isam2": ("99th percentile relative to that iSAM2", 2),
-    "mean_by_landmark": ("mean update relative to landmark-fixed-lag", 2),
-    "mean": ("mean update [ms]", 1),
-    "p99": ("99th percentile of an update [ms]", 1),
-    "closing": ("update that closes the loop [ms]", 1),
-    "swap": ("update that swaps the map [ms]", 1),
-    "slowest_other": ("slowest of all other updates [ms]", 1),
-    "solve": ("batch of the open lap, in its own process [s]", 1),
-}
-CLOSING: Final = (  # metrics by which a map is compared with that of the batch, lap by lap
-    *("rmse", "missed", "reach_median", "rmse_by_batch", "turn_from_batch", "turn_nees", "inside", "ate"),
-)
-COMPARED: Final = (  # metrics of the wider comparison
-    *("missed_2m", "missed_1m", "rmse_capped", "mapped_to_truth", "truth_to_mapped", "ghost_landmarks"),
-    *("ghost_metres", "along", "across", "nees", "inside", "closed", "bytes", "bytes_covariance"),
-)
-PAPER: Final = ("rmse", "missed", "size", "ate", "inside")
-REACH: Final = ("reach_median", "reach_p10", "reach_short", "reach_error", "rmse")
-CAMERA: Final = (
-    *("rmse", "rmse_aligned", "missed", "closed", "nees", "turn_nees", "map_scale_nees", "reported_degraded"),
-)
-LINES: Final = ("rmse", "rmse_aligned", "missed", "closed", "size", "ate", "nees")
-CENTRE_LINE: Final = (
-    *("rmse", "missed", "nees", "inside", "centre", "centre_nees", "half_width", "half_width_nees"),
-)
-
+ONLINE, BATCH, LANDMARKS = "fixed-lag", "spline", "landmark-fixed-lag"
+GENERATED: Final = (0, 1, 2)  # seeds of the generated tracks of the benchmark
+FILE: Final = Path(__file__).with_suffix(".toml")
+STUDIES: Final = parse_toml(read_text(FILE), FILE)
+QUICKEST: Final = ("accuracy", "skidpad", "camera", "faults", "robust", "speed", "scale")
+"""Experiments of a quick report: the others have no table of their own kind."""
 Tables = dict[str, Table]  # tables of an experiment, by what follows its name; empty for the one of that name
 
 
@@ -76,99 +49,59 @@ class Plan:
     jobs: int = 1
     on_cell: Callable[[int, int], None] | None = None  # observer of the progress of a study
 
-    def accuracy(self, folder: Path) -> Tables:
-        """Drive every estimator on all tracks, with two seeds for three laps; later laps change little."""
-        tracks: tuple[Path | int, ...] = GENERATED[:1] if self.quick else (*GENERATED, *self.tracks)
-        estimators, laps = (ESTIMATORS[:3], 2) if self.quick else (ESTIMATORS, 3)
-        drives: dict[str, Any] = {"tracks": tracks, "estimators": estimators, "seeds": (0, 1), "laps": laps}
-        study = Study(name="accuracy", baseline=Baseline(estimator=ONLINE), metrics=PAPER, **drives)
-        frame = self._run(study, folder)
-        first = frame[(frame["lap"] == 1) & frame["estimator"].isin([ONLINE, LANDMARKS])]
-        return {
-            "": views.laps_table(frame, (1, 2, laps), CLOSING),
-            "estimators": views.study_table(study, frame),
-            "metrics": views.metrics_table(frame, COMPARED),
-            "tracks": views.tracks_table(frame),
-            "laps": views.rmse_table(frame),
-            "reach": views.metrics_table(first, REACH),
-        }
+    @property
+    def how(self) -> dict[str, Any]:
+        return {"jobs": self.jobs, "on_cell": self.on_cell}
 
-    def skidpad(self, folder: Path) -> Tables:
-        seeds, names = tuple(range(2 if self.quick else 10)), ESTIMATORS[: 2 if self.quick else 4]
-        study = Study(name="skidpad", tracks=(Path("skidpad"),), estimators=names, seeds=seeds, laps=1)
-        return {"": views.skidpad_table(self._run(study, folder))}
-
-    def camera(self, folder: Path) -> Tables:
-        """Drive the study `camera` with one seed, whose noise is another one on each track."""
-        study, frame = self._shipped("camera", folder, seeds=(0,))
-        (noise,), (seed,), tracks = study.noise, study.seeds, load_tracks(study.tracks)
-        drives = [Drive(track, seed, noise, study.simulation(noise)) for track in tracks]
-        parts = [{"track": d.track, "settings": d.simulation, "seed": d.own_seed} for d in drives]
-        limits = self._rows(landmark_limit, parts, folder / "landmarks")
-        return {"": views.camera_table(frame, limits, CAMERA)}
-
-    def hard(self, folder: Path) -> Tables:
-        study, frame = self._shipped("hard", folder, seeds=(0,))
-        return {"": views.laps_table(frame, (1, 2, study.laps), CLOSING)}
-
-    def lines(self, folder: Path) -> Tables:
-        """Drive the study `lines`, and the landmark graph where points are 4 m apart: each is a landmark."""
-        study, frame = self._shipped("lines", folder / "curves", seeds=(0,))
-        name = "4 m"
-        beside = replace(study, estimators=(LANDMARKS,), noise={name: study.noise[name]})
-        frame = pd.concat([frame, self._run(beside, folder / "landmarks")], ignore_index=True)
-        return {"": views.runs_table(frame, ("noise", "estimator"), LINES)}
-
-    def endurance(self, folder: Path) -> Tables:
-        study, frame = self._shipped("endurance", folder, laps=30)
-        shown = [lap for lap in (3, 10, 30) if lap <= study.laps] or [study.laps]
-        return {"": views.laps_table(frame, shown, ("rmse", "inside", "nees", "ate"))}
-
-    def centerline(self, folder: Path) -> Tables:
-        """Drive estimators of two boundaries, whose centre line is compared with the true one."""
-        return {"": views.metrics_table(self._shipped("centerline", folder, seeds=(0,))[1], CENTRE_LINE)}
-
-    def ablation(self, folder: Path) -> Tables:
-        """Drive the study of the folder's name for two laps, under the first and the last of its noises.
-
-        One drive on each of four tracks: drives of one track are no independent samples.
-        """
-        name = folder.name
-        noises = list(read_study_file(find_study(Path(name))).noise.items())
-        small: dict[str, Any] = {"laps": 2, "noise": dict([noises[0], noises[-1]])}
-        return {"": views.study_table(*self._shipped(name, folder, tracks=(0, 1, 2, 3), seeds=(0,), **small))}
-
-    def faults(self, folder: Path) -> Tables:
-        """Drive the suite of faults at the middle strengths."""
-        study = at_strength(suite(), 0.5)
+    def study(self, folder: Path) -> Tables:
+        """Drive the study of the folder's name as `report.toml` says, and make its tables."""
+        about = STUDIES[folder.name]
+        study = smaller(read_study_file(find_study(Path(folder.name))), about.get("drives", {}))
+        if folder.name == "accuracy" and not self.quick:
+            study = replace(study, tracks=(*study.tracks, *self.tracks))
+        if folder.name == "faults":
+            study = at_strength(study, 0.5)
+            study = only(study, kinds(study)[:1]) if self.quick else study
         if self.quick:
-            study = replace(only(study, kinds(study)[:1]), tracks=(0,), laps=1)
-        return {"": fault_table(study, outcomes(study, self._run(study, folder)))}
-
-    def hints(self, folder: Path) -> Tables:
-        tracks, mistakes = (GENERATED[:1], [*MISTAKES][:2]) if self.quick else (GENERATED, [*MISTAKES])
-        return {"": hints.hints_table(self._rows(hints.judge, hints.parts_of(tracks, mistakes), folder))}
+            study = smaller(
+                first_variant(study), about.get("quick", {"tracks": [0], "seeds": [0], "laps": 1})
+            )
+        frame = run_study(study, folder, **self.how)
+        if "beside" in about:
+            other = run_study(smaller(study, about["beside"]), folder / "beside", **self.how)
+            frame = pd.concat([frame, other], ignore_index=True)
+        found = dict[str, Table]()
+        for part, wanted in about["tables"].items():
+            options = {key: value for key, value in wanted.items() if key != "kind"}
+            found[part] = KINDS[wanted["kind"]](study, frame, **options)
+        if folder.name == "camera":
+            plan = make_plan(study)
+            drives = [d for d in dict.fromkeys(cell.drive for cell in plan.cells) if isinstance(d, Drive)]
+            parts = [{"track": d.track, "settings": d.simulation, "seed": d.own_seed} for d in drives]
+            limit = mean("rmse", self.rows(landmark_limit, parts, folder / "landmarks"))
+            frame = found[""].frame
+            frame.loc[len(frame)] = ["landmarks, given all", limit, *[UNKNOWN] * (frame.shape[1] - 2)]
+        return found
 
     def joint(self, folder: Path) -> Tables:
         tracks, drives = ((50,), 2) if self.quick else ((50, 51, 52), 8)
-        return {"": joint.joint_table(self._rows(joint.of_track, on_tracks(tracks, drives=drives), folder))}
+        return {"": joint.joint_table(self.rows(joint.of_track, on_tracks(tracks, drives=drives), folder))}
 
     def known(self, folder: Path) -> Tables:
         tracks, begins = ((60,), (0.3,)) if self.quick else (range(60, 68), (0.0, 0.3, 0.6))
-        return {"": known.known_table(self._rows(known.of_track, on_tracks(tracks, begins=begins), folder))}
+        return {"": known.known_table(self.rows(known.of_track, on_tracks(tracks, begins=begins), folder))}
 
     def speed(self, _: Path) -> Tables:
         """Time every estimator in turn on the same cycles."""
         seeds, laps = (GENERATED[:1], 1) if self.quick else (GENERATED, 5)
-        runs = [figures(measure_drive(seed, laps)) for seed in seeds]
-        values = pd.DataFrame(runs).reindex(columns=[*SPEED])
-        rows = ((label, Quantity.of(values[key], digits)) for key, (label, digits) in SPEED.items())
-        return {"": Table(("figure", "measured"), tuple(rows))}
+        runs = pd.DataFrame([speed_of_drive(seed, laps) for seed in seeds]).reindex(columns=[*SPEED])
+        rows = ((label, estimate(runs[key]).text(digits)) for key, (label, digits) in SPEED.items())
+        return {"": Table.of(("figure", "measured"), rows)}
 
     def real_logs(self, folder: Path) -> Tables:
         if not self.real:
             raise SettingsError("--only real: expected logs in --real, found none")
-        drives = real.map_real_logs(self.real, folder, **self._how)
+        drives = real.map_real_logs(self.real, folder, **self.how)
         return {
             "runs": real.runs_table(drives),
             "maps": real.maps_table(drives),
@@ -181,45 +114,27 @@ class Plan:
         scaling = measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings, folder=folder)
         return {"": scaling_table(scaling)}
 
-    def _shipped(self, name: str, folder: Path, **small: Any) -> tuple[Study, pd.DataFrame]:
-        """Drive a shipped study, made smaller: with `quick` the first variant for one lap."""
-        study = replace(read_study_file(find_study(Path(name))), **small)
-        if self.quick:
-            grids = tuple({key: values[:1] for key, values in grid.items()} for grid in study.grids[:1])
-            variants = dict([*study.variants.items()][:1])
-            study = replace(study, tracks=(0,), seeds=(0,), laps=1, variants=variants, grids=grids)
-        return study, self._run(study, folder)
-
-    def _run(self, study: Study, folder: Path) -> pd.DataFrame:
-        return run_study(study, folder, **self._how)
-
-    def _rows(self, function: RowsOf, parts: list[dict[str, Any]], folder: Path) -> pd.DataFrame:
-        return rows_of(function, parts, folder, **self._how)
-
-    @property
-    def _how(self) -> dict[str, Any]:
-        return {"jobs": self.jobs, "on_cell": self.on_cell}
+    def rows(self, function: RowsOf, parts: list[dict[str, Any]], folder: Path) -> pd.DataFrame:
+        return rows_of(function, parts, folder, **self.how)
 
 
 EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Tables]]] = {
-    "accuracy": Plan.accuracy,
-    "skidpad": Plan.skidpad,
-    "camera": Plan.camera,
-    "faults": Plan.faults,
-    "hard": Plan.hard,
-    "lines": Plan.lines,
-    "endurance": Plan.endurance,
-    "centerline": Plan.centerline,
-    **dict.fromkeys(ABLATIONS, Plan.ablation),
-    "hints": Plan.hints,
-    "known": Plan.known,
-    "joint": Plan.joint,
-    "speed": Plan.speed,
-    "scale": Plan.scale,
+    **dict.fromkeys(STUDIES, Plan.study),
+    **{"known": Plan.known, "joint": Plan.joint, "speed": Plan.speed, "scale": Plan.scale},
     "real": Plan.real_logs,
 }
-QUICKEST: Final = ("accuracy", "skidpad", "camera", "faults", "robust", "hints", "speed", "scale")
-"""Experiments of a quick report: the others have no view of their own."""
+
+
+def smaller(study: Study, parts: Mapping[str, Any]) -> Study:
+    """Return a study with some parts replaced; of its noises those that are named are kept."""
+    noise = {name: study.noise[name] for name in parts.get("noise", study.noise)}
+    return replace(study, **{**parts, "noise": noise})
+
+
+def first_variant(study: Study) -> Study:
+    """Return a study with its first variant and the first value of its first grid."""
+    grids = tuple({key: values[:1] for key, values in grid.items()} for grid in study.grids[:1])
+    return replace(study, grids=grids, variants=dict([*study.variants.items()][:1]))
 
 
 def write_report(plan: Plan, folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Table]]:
@@ -228,20 +143,91 @@ def write_report(plan: Plan, folder: Path, names: Sequence[str] = ()) -> Iterato
         check_name(name, EXPERIMENTS, "--only: expected an experiment")
     every = QUICKEST if plan.quick else [name for name in EXPERIMENTS if name != "real" or plan.real]
     for name in names or every:
+        run = made(__name__)
+        given = {"accuracy": " --tracks TRACKS" * bool(plan.tracks), "real": " --real LOGS"}.get(name, "")
+        about = {
+            "commit": run["commit"],
+            "machine": run["processor"],
+            "date": run["date"][:10],
+            "command": f"pathspace-graph report --only {name}{given}{' --quick' * plan.quick}",
+        }
         for part, table in EXPERIMENTS[name](plan, folder / name).items():
             file = folder / f"{'_'.join(filter(None, (name, part)))}.csv"
-            write_csv(file, table.tidy().assign(**provenance(plan, name)))
+            write_csv(file, table.tidy.assign(**about))
             yield file, table
 
 
-def provenance(plan: Plan, name: str) -> dict[str, str]:
-    """Return commit, machine and date of this run, and the command that measures an experiment again."""
-    run = made(__name__)
-    given = {"accuracy": " --tracks TRACKS" * bool(plan.tracks), "real": " --real LOGS"}.get(name, "")
-    command = f"pathspace-graph report --only {name}{given}{' --quick' * plan.quick}"
-    return {
-        "commit": run["commit"],
-        "machine": run["processor"],
-        "date": run["date"][:10],
-        "command": command,
+# --- kinds of tables -------------------------------------------------------------------------------------
+
+
+def laps_table(study: Study, frame: pd.DataFrame, laps: Sequence[int], metrics: Sequence[str]) -> Table:
+    """Return metrics of the online map after some laps, and of the batch where it ran."""
+    online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
+    shown = [lap for lap in laps if lap <= study.laps] or [study.laps]
+    columns = {f"lap {lap}": online[online["lap"] == lap] for lap in shown}
+    return by_metric(columns | ({"batch": last_laps(batch)} if len(batch) else {}), metrics)
+
+
+def estimators_table(
+    study: Study,
+    frame: pd.DataFrame,
+    metrics: Sequence[str],
+    estimators: Sequence[str] = (),
+    lap: int | None = None,
+) -> Table:
+    """Return metrics of estimators, one in each column, after a lap or at the end of the last one."""
+    chosen = frame[frame["estimator"].isin(estimators or study.estimators)]
+    chosen = chosen if lap is None else chosen[chosen["lap"] == lap]
+    return by_metric(dict(iter(last_laps(chosen).groupby("estimator", sort=False))), metrics)
+
+
+def tracks_table(_: Study, frame: pd.DataFrame) -> Table:
+    """Return the online map and that of the batch, track by track: too few drives for an interval."""
+    online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
+    first, last = online[online["lap"] == 1], last_laps(online)
+    columns = {
+        "rmse, lap 1 [m]": ("rmse", first),
+        "rmse, last lap [m]": ("rmse", last),
+        "rmse, batch [m]": ("rmse", last_laps(batch)),
+        "missed, lap 1 [%]": ("missed", first),
+        "size [% of cones]": ("size_share", last),
+        "within 2σ [%]": ("inside", last),
+        "NEES": ("nees", last),
     }
+    rows = []
+    for track in frame["track"].unique():
+        of = ((METRICS[key], key, runs[runs["track"] == track]) for key, runs in columns.values())
+        values = (m.text(m.over(runs[key].astype(float))) if key in runs else UNKNOWN for m, key, runs in of)
+        rows.append((str(track), *values))
+    return Table.of(("track", *columns), rows)
+
+
+def rmse_table(_: Study, frame: pd.DataFrame) -> Table:
+    """Return the rmse of every online estimator after each lap."""
+    laps = frame[frame["lap"] > 0]
+    several = laps.groupby("estimator", sort=False)["lap"].transform("nunique") > 1
+    names = {name: runs.groupby("lap") for name, runs in laps[several].groupby("estimator", sort=False)}
+    rows = [
+        (str(lap), *(mean("rmse", of.get_group(lap)) for of in names.values()))
+        for lap in sorted(laps["lap"].unique())
+    ]
+    return Table.of(("rmse after lap [m]", *names), rows)
+
+
+def skidpad_table(_: Study, frame: pd.DataFrame, metrics: Sequence[str]) -> Table:
+    """Return every estimator: its trajectory error over the whole drive, and its map at the end."""
+    square = (frame["ate"] ** 2).groupby([frame[name] for name in RUN_OF]).transform("mean")
+    return by_name(frame.assign(ate=square**0.5), ("estimator",), metrics)
+
+
+KINDS: Final[Mapping[str, Callable[..., Table]]] = {
+    "laps": laps_table,
+    "estimators": estimators_table,
+    "tracks": tracks_table,
+    "rmse": rmse_table,
+    "skidpad": skidpad_table,
+    "differences": contrast_table,
+    "runs": lambda _, frame, names, metrics: by_name(frame, names, metrics),
+    "faults": lambda study, frame: fault_table(study, outcomes(study, frame)),
+}
+"""Tables of a study and its results, with options."""

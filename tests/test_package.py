@@ -184,7 +184,7 @@ ctypes.CDLL = library
 import pathspace_graph as package
 [getattr(package, name) for name in package.__all__]
 import pathspace_graph.eval.metrics.accuracy, pathspace_graph.eval.figures.map_plot
-import pathspace_graph.eval.benchmark.scaling
+import pathspace_graph.eval.benchmark
 """
     assert "pathspace_graph.eval.figures.map_plot" in modules_after(code)
 

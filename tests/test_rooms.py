@@ -59,13 +59,12 @@ ARROWS: dict[str, set[str]] = {
     "eval.metrics": BELOW_EVAL,
     "eval.figures": BELOW_EVAL | {"eval.metrics"},
     "eval.experiment": BELOW_EVAL | {"eval.metrics", "eval.figures"},
-    "eval.benchmark": BELOW_EVAL | {"eval.metrics", "eval.figures", "eval.experiment"},
-    "eval": BELOW_EVAL | {"eval.metrics", "eval.experiment", "eval.benchmark"},
+    "eval": BELOW_EVAL | {"eval.metrics", "eval.figures", "eval.experiment"},
     "eval.view": BELOW_MAPPING | {"eval.metrics", "eval.figures"},
     "commands": BELOW_EVAL
     | {"convert", "frames", "options"}
     | {"eval"}
-    | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "benchmark", "view")},
+    | {f"eval.{room}" for room in ("metrics", "figures", "experiment", "view")},
     "ros": BELOW_ESTIMATORS | {"convert", "online", "loop"},
     "frames": {"io"},
     "cli": {"commands", "options"},

@@ -12,13 +12,13 @@ from typing import Any, Final, NamedTuple
 import pandas as pd
 
 from pathspace_graph.errors import SettingsError, check_name
-from pathspace_graph.eval.metrics.metric import METRICS
+from pathspace_graph.eval.metrics.metric import METRICS, figures
 from pathspace_graph.io.files import write_json
 from pathspace_graph.plausibility.diagnosis import PRIOR_LIMIT
 
-from .frame import RUN, last_laps, write_csv, write_results
+from .statistics import RUN, last_laps
 from .study import Study, find_study, read_study_file
-from .tables import Quantity, Table
+from .tables import Table, write_csv, write_results
 
 CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
 Values = Mapping[str, Any]  # values of an outcome by name
@@ -39,11 +39,10 @@ COLUMNS: Final = {  # of the table of faults: value and digits
     "longest time over 1 m off [s]": ("divergence_time", 1),
     "longest way over 1 m off [m]": ("divergence_distance", 0),
 }
+_SAID: Final = ("reported_degraded", "reported_lost")
 _WORST: Final = ("error_max", "divergence_time", "divergence_distance")
-_MEASURED: Final = (
-    *("rmse", "size", "missed", "closed_at_end", "lost_at_end"),
-    *("reported_degraded", "reported_lost", *_WORST),
-)
+_ENDS: Final = {"closed": "closed_at_end", "lost": "lost_at_end"}
+_MEASURED: Final = ("rmse", "size", "missed", *_SAID, *_WORST, *_ENDS.values())
 _NAME: Final = re.compile(r"(?P<kind>.+): (?P<value>[-+]?\d+(\.\d+)?)( (?P<unit>\S+))?")
 
 
@@ -69,13 +68,8 @@ def suite() -> Study:
     return read_study_file(find_study(Path("faults")))
 
 
-def by_kind(study: Study) -> list[list[str]]:
-    """Return the noises of each kind of fault, in ascending strength."""
-    return [list(noises) for _, noises in groupby(study.noise, lambda noise: fault_of(noise).kind)]
-
-
 def kinds(study: Study) -> list[str]:
-    return [fault_of(noises[0]).kind for noises in by_kind(study) if noises != [CLEAN]]
+    return [kind for kind in dict.fromkeys(fault_of(noise).kind for noise in study.noise) if kind != CLEAN]
 
 
 def only(study: Study, wanted: Sequence[str]) -> Study:
@@ -83,17 +77,14 @@ def only(study: Study, wanted: Sequence[str]) -> Study:
     for kind in wanted:
         check_name(kind, kinds(study), "--only: expected a known fault")
     keep = {CLEAN, *(wanted or kinds(study))}
-    return _with(study, [noise for noise in study.noise if fault_of(noise).kind in keep])
+    return replace(study, noise={name: of for name, of in study.noise.items() if fault_of(name).kind in keep})
 
 
 def at_strength(study: Study, share: float) -> Study:
     """Return the suite with one strength of each fault: the middle one at 0.5, the greatest at 1."""
-    groups = ((noises, len(noises)) for noises in by_kind(study))
-    return _with(study, [noises[min(int(share * count), count - 1)] for noises, count in groups])
-
-
-def _with(study: Study, noises: Sequence[str]) -> Study:
-    return replace(study, noise={noise: study.noise[noise] for noise in noises})
+    groups = ([*noises] for _, noises in groupby(study.noise, lambda noise: fault_of(noise).kind))
+    chosen = [noises[min(int(share * len(noises)), len(noises) - 1)] for noises in groups]
+    return replace(study, noise={noise: study.noise[noise] for noise in chosen})
 
 
 # --- outcomes --------------------------------------------------------------------------------------------
@@ -102,35 +93,35 @@ def _with(study: Study, noises: Sequence[str]) -> Study:
 def outcomes(study: Study, frame: pd.DataFrame) -> list[dict[str, Any]]:
     """Return plain values of every noise of a suite at the end of the last lap; NaN is unknown."""
     every, failures = beside_clean(frame), frame.loc[frame["failure"] != "", "noise"].value_counts()
-    of = ((fault_of(noise), every[every["noise"] == noise], failures.get(noise, 0)) for noise in study.noise)
-    return [_outcome(fault, runs, int(failed)) for fault, runs, failed in of]
-
-
-def _outcome(fault: Fault, runs: pd.DataFrame, failed: int) -> dict[str, Any]:
-    ratios = runs["ratio"].dropna()
-    sigmas = {key: float(runs[key].astype(float).mean()) for key in runs if key.endswith("_by_prior")}
-    titles = {key: METRICS[key].title.removesuffix(" by its prior's sigma") for key in sigmas}
-    return {
-        **{"fault": fault.kind, "strength": fault.value, "unit": fault.unit},
-        **{"runs": len(runs), "failed": failed, "with_map": len(ratios)},
-        **{f"ratio_{name}": float(ratios.agg(name)) for name in ("mean", "min", "max")},
-        "size_ratio": float(runs["size_ratio"].mean()),
-        "missed": float(runs["missed"].mean()),
-        "closed": int((runs["closed_at_end"] == 1.0).sum()),
-        "lost": int((runs["lost_at_end"] == 1.0).sum()),
-        **{name: float(runs[name].max()) for name in _WORST},
-        "reported": int(runs["reported"].sum()),
-        "reported_degraded": float(runs["reported_degraded"].mean()),
-        "reported_lost": float(runs["reported_lost"].mean()),
-        "calibration": {titles[key]: value for key, value in sigmas.items() if abs(value) > PRIOR_LIMIT},
-        "notices": dict(Counter(text for text in runs["notices"] if text).most_common()),
-    }
+    found = []
+    for noise in study.noise:
+        fault, runs = fault_of(noise), every[every["noise"] == noise]
+        sigmas = {key: float(runs[key].astype(float).mean()) for key in runs if key.endswith("_by_prior")}
+        titles = {key: METRICS[key].title.removesuffix(" by its prior's sigma") for key in sigmas}
+        values = {
+            **{"fault": fault.kind, "strength": fault.value, "unit": fault.unit},
+            **{
+                "runs": len(runs),
+                "failed": int(failures.get(noise, 0)),
+                "with_map": int(runs["ratio"].count()),
+            },
+            **{f"ratio_{name}": float(runs["ratio"].agg(name)) for name in ("mean", "min", "max")},
+            **{name: float(runs[name].mean()) for name in ("size_ratio", "missed")},
+            **{name: int((runs[key] == 1.0).sum()) for name, key in _ENDS.items()},
+            **{name: float(runs[name].max()) for name in _WORST},
+            "reported": int(runs["reported"].sum()),
+            **{name: float(runs[name].mean()) for name in _SAID},
+        }
+        values["calibration"] = {titles[key]: v for key, v in sigmas.items() if abs(v) > PRIOR_LIMIT}
+        values["notices"] = dict(Counter(text for text in runs["notices"] if text).most_common())
+        found.append(values)
+    return found
 
 
 def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the last laps of the runs that finished, beside the clean run of the same track and seed.
 
-    `ratio` (of rmse) and `size_ratio` are to that run, NaN without a map; `told`: anything was said.
+    `ratio` (of rmse) and `size_ratio` are to that run, NaN without a map; `reported`: anything was said.
     """
     last = last_laps(frame)
     last = last.reindex(columns=[*dict.fromkeys([*last, *_MEASURED])]).astype(dict.fromkeys(_MEASURED, float))
@@ -141,46 +132,39 @@ def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     return last.assign(reported=(last["notices"] != "") | (last["reported_lost"] > 0.0))
 
 
-def fault_table(study: Study, found: Sequence[Values]) -> Table:
-    """Return the cost of each fault relative to the clean run of its track, and how often it is reported."""
+def fault_table(study: Study, found: Sequence[Values], *, notices: bool = False) -> Table:
+    """Return the cost of each fault relative to the clean run of its track, and how often it is reported.
+
+    With `notices` it has what was said as well: calibrations far from their prior (sigmas), and notices.
+    """
     rows = []
     for noise, values in zip(study.noise, found, strict=True):
-        runs = max(values["runs"], 1)
-        shares = {name: values[name] / runs for name in ("closed", "lost", "reported")}
+        shares = {name: values[name] / max(values["runs"], 1) for name in ("closed", "lost", "reported")}
         known = {**values, **shares}
-        figures = [100.0 * known[key] if "%" in title else known[key] for title, (key, _) in COLUMNS.items()]
-        rows.append((noise, *Quantity.row(figures, *(digits for _, digits in COLUMNS.values()))))
+        cells = [100.0 * known[key] if "%" in title else known[key] for title, (key, _) in COLUMNS.items()]
+        row = {"fault": noise}
+        row |= dict(zip(COLUMNS, figures(cells, *(digits for _, digits in COLUMNS.values())), strict=True))
+        if notices:
+            far = (f"{name} {sigmas:+.1f}" for name, sigmas in values["calibration"].items())
+            row["calibration by its prior's sigma"] = ", ".join(far)
+            said = values["notices"].items()  # the JSON file has all of a text
+            short = {text: text if len(text) <= 60 else f"{text[:60].rstrip()} …" for text, _ in said}
+            counted = (f"{number} of {values['runs']}: {short[text]}" for text, number in said)
+            row["notices"] = "; ".join(counted) or "nothing"
+        rows.append(row)
     title = (
         f"{study.name}: {study.question} {len(study.tracks)} tracks, {len(study.seeds)} seeds, "
         f"{study.laps} laps, {', '.join(study.estimators)}. The rmse is the map's at the end by that "
         "of the clean run on the same track and with the same seed. Lost means more than 5 m off in the last "
         "second."
     )
-    return Table(("fault", *COLUMNS), tuple(rows), title)
-
-
-def with_notices(table: Table, found: Sequence[Values]) -> Table:
-    """Return the table with what was said: calibrations far from their prior (sigmas), and notices."""
-    calibrations = (", ".join(f"{k} {v:+.1f}" for k, v in values["calibration"].items()) for values in found)
-    told = zip(table.rows, calibrations, map(_notices, found), strict=True)
-    header = (*table.header, "calibration by its prior's sigma", "notices")
-    return replace(table, header=header, rows=tuple((*row, *texts) for row, *texts in told))
-
-
-def _notices(values: Values) -> str:
-    """Return how many runs said what, shortened to 60 characters; the JSON file has all of it."""
-    short = {text: text if len(text) <= 60 else f"{text[:60].rstrip()} …" for text in values["notices"]}
-    said = (f"{number} of {values['runs']}: {short[text]}" for text, number in values["notices"].items())
-    return "; ".join(said) or "nothing"
-
-
-# --- files ---------------------------------------------------------------------------------------------
+    return Table(pd.DataFrame(rows), title)
 
 
 def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Write the results of every run, the table and the values; return the table's text."""
     faults = outcomes(study, frame)
-    table = with_notices(fault_table(study, faults), faults)
+    table = fault_table(study, faults, notices=True)
     write_results(frame, out)
     table.write(out, "faults", "txt", "md", "tex")
     about = {"estimator": study.estimators, "seeds": study.seeds, "laps": study.laps}

@@ -16,7 +16,7 @@ from typing import Any, Final, TypeVar
 from joblib import Parallel, delayed, parallel_config
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.errors import InputError, SettingsError, install
+from pathspace_graph.errors import InputError, OutputError, SettingsError, install
 from pathspace_graph.io.files import atomic_folder, to_plain, write_json, write_text
 from pathspace_graph.io.map import MAP_FILE
 from pathspace_graph.io.parsing import read_json
@@ -25,6 +25,11 @@ from pathspace_graph.loop.worker import end_with
 from .drives import identity
 from .provenance import Code, check_code, made
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 R = TypeVar("R")
 W = TypeVar("W")
 
@@ -32,6 +37,7 @@ CELLS: Final = "cells"  # folder of the kept cells
 FORMAT: Final = "pathspace-cell/5"
 FILES: Final = "files"  # key of the files of a run, on their way from its process
 DIGEST: Final = "digest"  # key of a record's digest in its file
+LOCK: Final = ".running"  # file that is locked while a study runs
 CONNECT_SECONDS: Final = 20.0  # time (s) within which a cluster has to answer
 Record = dict[str, Any]  # what is kept of a cell, in the types of JSON only
 OnCell = Callable[[int, int], None]  # called with the numbers of cells that are done, and of all
@@ -112,17 +118,13 @@ def run_cells(
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
     told = on_cell or (lambda *_: None)
     told(0, len(remaining))
-    for done, (cell, found) in enumerate(outcomes(_record, remaining), start=1):
+    for done, (cell, found) in enumerate(outcomes(Cell.record, remaining), start=1):
         record = cell.failed(found) if isinstance(found, WorkerDiedError) else found
         record["made"]["command"] = command
         write_record(folder, cell, record)
         records[cell.id] = record
         told(done, len(remaining))
     return {name: records[name] for name in every}
-
-
-def _record(cell: Cell) -> Record:
-    return cell.record()
 
 
 # --- what is kept ------------------------------------------------------------------------------------------
@@ -180,6 +182,23 @@ def unfinished(out: Path) -> Iterator[Path]:
     shutil.rmtree(folder, ignore_errors=True)
 
 
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Keep other processes from running a study in a folder; OutputError where one already does.
+
+    The lock of a process ends with it, however it ends. Windows has no such locks.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / LOCK).open("a", encoding="utf-8") as file:
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise OutputError(f"{out}: expected no study that runs there, found one") from error
+        yield
+        (out / LOCK).unlink(missing_ok=True)
+
+
 # --- workers -----------------------------------------------------------------------------------------------
 
 
@@ -218,38 +237,35 @@ def outcomes(work: Callable[[W], R], items: Sequence[W]) -> Iterator[tuple[W, R 
 
     When a worker dies, nobody knows which item it had, so each item under way is tried again alone.
     """
-    remaining, sent = dict(enumerate(items)), dict[int, W]()
+    remaining, sent = dict(enumerate(items)), list[int]()
+
+    def run(numbers: Iterable[int], **options: Any) -> Iterator[tuple[int, R]]:
+        def tasks() -> Iterator[Any]:
+            for number in numbers:
+                sent.append(number)
+                yield delayed(_numbered)(work, number, remaining[number])
+
+        yield from Parallel(return_as="generator_unordered", batch_size=1, **options)(tasks())
+
+    deaths = _deaths()
     while remaining:
         sent.clear()
         try:
-            for index, result in _run(work, _noted(remaining, sent)):
-                yield remaining.pop(index), result
-        except _deaths():
-            for index in sent.keys() & remaining:
-                yield sent[index], _alone(work, remaining.pop(index))
+            for number, result in run(list(remaining)):
+                yield remaining.pop(number), result
+        except deaths:
+            for number in [number for number in sent if number in remaining]:
+                try:
+                    ((_, again),) = run([number], n_jobs=2)  # one job would be done by this very process
+                except deaths as error:
+                    died = WorkerDiedError(f"the process that ran it died ({type(error).__name__})")
+                    yield remaining.pop(number), died
+                else:
+                    yield remaining.pop(number), again
 
 
-def _noted(items: dict[int, W], sent: dict[int, W]) -> Iterator[tuple[int, W]]:
-    for index, item in list(items.items()):
-        sent[index] = item
-        yield index, item
-
-
-def _run(work: Callable[[W], R], tasks: Iterable[tuple[int, W]], **options: Any) -> Iterator[tuple[int, R]]:
-    parallel = Parallel(return_as="generator_unordered", batch_size=1, **options)
-    yield from parallel(delayed(_numbered)(work, index, item) for index, item in tasks)
-
-
-def _numbered(work: Callable[[W], R], index: int, item: W) -> tuple[int, R]:
-    return index, work(item)
-
-
-def _alone(work: Callable[[W], R], item: W) -> R | WorkerDiedError:
-    try:
-        ((_, result),) = _run(work, [(0, item)], n_jobs=2)  # one job would be done by this very process
-    except _deaths() as error:
-        return WorkerDiedError(f"the process that ran it died ({type(error).__name__})")
-    return result
+def _numbered(work: Callable[[W], R], number: int, item: W) -> tuple[int, R]:
+    return number, work(item)
 
 
 def _deaths() -> tuple[type[Exception], ...]:

@@ -1,14 +1,23 @@
 """Means and paired differences with their intervals, and tests of them, over drives that share tracks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Final
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 from scipy import stats
 
+from pathspace_graph.eval.metrics.metric import METRICS, figure
 from pathspace_graph.factors.arrays import Array
 
+from .study import Study
+
+COMBINATION: Final = ("noise", "estimator", "variant")  # columns of a combination, which is compared
+RUN: Final = ("track", "seed")  # columns of a drive; combinations are paired on the same drive and noise
+RUN_OF: Final = (*RUN, *COMBINATION)
+TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
 LEVEL: Final = 0.95  # confidence level of intervals; a difference is significant if p < 1 - LEVEL
 RESAMPLES: Final = 2000
 ROUND_OFF: Final = 1e-12  # share of differences below which they are all the same
@@ -23,6 +32,9 @@ class Estimate:
     half: float  # half the width of the interval; NaN for fewer than two samples
     count: int  # number of samples
 
+    def text(self, digits: int = 3, factor: float = 1.0, sign: str = "") -> str:
+        return figure(factor * self.mean, factor * self.half, digits, sign)
+
 
 def by_track(values: pd.Series) -> pd.Series:
     """Return the mean of each track, of values by track and seed; of a single track the values themselves.
@@ -34,24 +46,26 @@ def by_track(values: pd.Series) -> pd.Series:
     return tracks if len(tracks) > 1 else values
 
 
-def estimate(values: Array) -> Estimate:
-    """Return the mean m of independent values (n,) and its interval m -+ q s / sqrt(n).
+def estimate(values: ArrayLike) -> Estimate:
+    """Return the mean m of the known ones of independent values (n,) and its interval m -+ q s / sqrt(n).
 
     From `FEWEST` values on, q is the quantile of `|m* - m| sqrt(n) / s*` over resamples with replacement (the
     bootstrap-t, which covers skewed values better than Student's t); below, it is Student's. The plain
     percentiles of m* would cover the mean of five normal values in 84 % of the cases only. Half an
     interval by resamples is at most the range of the values: s* is tiny in resamples without an outlier.
     """
-    n = len(values)
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    n = len(known)
     if n < 2:
-        return Estimate(float(values[0]) if n else float("nan"), float("nan"), n)
-    mean, sem = float(np.mean(values)), float(np.std(values, ddof=1) / n**0.5)
+        return Estimate(float(known[0]) if n else float("nan"), float("nan"), n)
+    mean, sem = float(np.mean(known)), float(np.std(known, ddof=1) / n**0.5)
     quantile = float(stats.t.ppf(0.5 + LEVEL / 2, n - 1))
     if n >= FEWEST and sem > 0.0:
-        drawn = values[np.random.default_rng(0).integers(0, n, (RESAMPLES, n))]
+        drawn = known[np.random.default_rng(0).integers(0, n, (RESAMPLES, n))]
         off, spread = np.abs(drawn.mean(axis=1) - mean), drawn.std(axis=1, ddof=1) / n**0.5
         quantile = float(np.quantile(off[spread > 0.0] / spread[spread > 0.0], LEVEL))
-        quantile = min(quantile, float(np.ptp(values)) / sem)
+        quantile = min(quantile, float(np.ptp(known)) / sem)
     return Estimate(mean, quantile * sem, n)
 
 
@@ -88,3 +102,58 @@ def holm(p: Array) -> Array:
     factors = len(order) - np.arange(len(order))
     corrected[order] = np.minimum(np.maximum.accumulate(factors * p[order]), 1.0)
     return corrected
+
+
+# --- contrasts -------------------------------------------------------------------------------------------
+
+
+def last_laps(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the last row of each run that finished."""
+    finished = frame[frame["failure"] == ""]
+    return finished.groupby(list(RUN_OF), sort=False).tail(1)
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One metric of one combination, and its difference from the baseline, drive by drive."""
+
+    noise: str
+    estimator: str
+    variant: str
+    metric: str  # key of the metric
+    runs: int  # number of runs with a value at the end of their last lap
+    value: Estimate  # mean over the tracks
+    difference: Estimate | None  # mean over the tracks; None for the baseline itself
+    differences: tuple[float, ...] = ()  # of each track, or of each drive of a single track
+    p: float = float("nan")  # p of the paired t-test over them, corrected for all hypotheses of the metric
+    wilcoxon: float = float("nan")  # p of Wilcoxon's signed-rank test over them, not corrected
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance alone rarely makes such a difference anywhere in the study."""
+        return bool(self.p < 1.0 - LEVEL)
+
+
+def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
+    """Return every combination against the baseline of its noise, in the study's order.
+
+    Nothing is tested where all differences are 0, as between cells that mean the same, nor of a wall time,
+    which depends on what else the machine does. The cells of a drive are run one after another, so that
+    processor times are.
+    """
+    known = last_laps(frame).astype({metric: float}).dropna(subset=[metric])
+    runs = {key: of.set_index([*RUN])[metric] for key, of in known.groupby([*COMBINATION], sort=False)}
+    nothing = pd.Series(dtype=float, index=pd.MultiIndex.from_arrays([[], []], names=RUN))
+    contrasted = []
+    for key in product(study.noises, study.estimators, study.points):
+        base = (key[0], study.baseline.estimator or key[1], study.baseline_variant)
+        values, against = runs.get(key, nothing), runs.get(base, nothing)
+        contrast = Contrast(*key, metric, len(values), estimate(by_track(values)), None)
+        if key != base:
+            d = by_track((values - against).dropna()).to_numpy()
+            contrast = replace(contrast, difference=estimate(d), differences=tuple(d.tolist()))
+            if d.any() and METRICS[metric].time != "wall":
+                contrast = replace(contrast, p=paired_p(d), wilcoxon=wilcoxon_p(d))
+        contrasted.append(contrast)
+    corrected = holm(np.array([contrast.p for contrast in contrasted]))
+    return [replace(contrast, p=float(p)) for contrast, p in zip(contrasted, corrected, strict=True)]

@@ -1,207 +1,144 @@
-"""Tables in every form, and those of a study."""
+"""Tables of texts in every form, those of a study, and the files of its results."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import repeat
-from math import isfinite, nan
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 from rich.table import Table as RichTable
 from rich.text import Text
-from tabulate import LATEX_ESCAPE_RULES, SEPARATING_LINE, tabulate
+from tabulate import LATEX_ESCAPE_RULES
 
 from pathspace_graph.eval.figures.style import save_figures
-from pathspace_graph.eval.metrics.metric import (
-    HIGHER,
-    LOWER,
-    MEAN_DIGITS,
-    METRICS,
-    UNKNOWN,
-    Metric,
-)
-from pathspace_graph.io.files import write_text
+from pathspace_graph.eval.metrics.metric import HIGHER, LOWER, METRICS, UNKNOWN, Metric, figure
+from pathspace_graph.io.files import replacing, write_text
 
-from .frame import COMBINATION, RUN, RUN_OF, Contrast, contrasts, last_laps, write_results
 from .plots import plot_differences
-from .statistics import FEWEST, LEVEL, Estimate, estimate
+from .statistics import (
+    COMBINATION,
+    FEWEST,
+    LEVEL,
+    RUN,
+    RUN_OF,
+    TIMES,
+    Estimate,
+    by_track,
+    contrasts,
+    estimate,
+    last_laps,
+)
 from .study import Study
 
+MADE: Final = ("commit", "host", "processor", "blas", "date", "command")  # where and when a run was made
+MEAN_DIGITS: Final = 2  # least number of digits after the decimal point of a mean beside its difference
+FORMS: Final = {"txt": "simple", "md": "pipe"}  # form in tabulate by the suffix of a file
 _UNICODE: Final = str.maketrans(  # LaTeX for characters that not every font has
     {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$", "×": r"$\times$"}
 )
-_MARKS: Final = ("\ue000", "\ue001")  # around what is bold until LaTeX is escaped
-_BOLD: Final = {"pipe": ("**", "**"), "latex_booktabs": (r"\textbf{", "}")}  # around what is bold, by form
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """A measured value in the unit of a table, with half the width of its interval."""
-
-    value: float | None  # None where it is unknown
-    half: float | None = None
-    digits: int = 3  # number of digits after the decimal point
-    sign: str = ""  # `+` for a difference
-    is_best: bool = False  # whether it is bold where the form of the table has that
-
-    @classmethod
-    def estimated(cls, of: Estimate, digits: int = 3, factor: float = 1.0, sign: str = "") -> Self:
-        """Return a mean with its 95 % interval, times a factor."""
-        value, half = (factor * float(x) if isfinite(x) else None for x in (of.mean, of.half))
-        return cls(value, half, digits, sign)
-
-    @classmethod
-    def of(cls, values: ArrayLike, digits: int = 3, factor: float = 1.0) -> Self:
-        """Return the mean of the known values (n,), times a factor."""
-        array = np.asarray(values, float)
-        return cls.estimated(estimate(array[np.isfinite(array)]), digits, factor)
-
-    @classmethod
-    def measured(cls, metric: Metric, value: float, half: float = nan) -> Self:
-        """Return a value of a metric in its unit."""
-        return cls.estimated(Estimate(value, half, 1), metric.digits, metric.factor)
-
-    @classmethod
-    def row(cls, values: Iterable[float], *digits: int) -> tuple[Self, ...]:
-        """Return values without intervals, each with its own digits, or all with the same."""
-        every = digits if len(digits) > 1 else repeat(*digits)
-        return tuple(cls.estimated(Estimate(v, nan, 1), k) for v, k in zip(values, every, strict=False))
-
-    @property
-    def texts(self) -> tuple[str, str]:
-        """Value and half width of its interval, rounded; empty where they are not known."""
-        value = "" if self.value is None else f"{self.value:{self.sign}.{self.digits}f}"
-        return value, "" if self.half is None else f"{self.half:.{self.digits}f}"
-
-    def __str__(self) -> str:
-        return " ± ".join(filter(None, self.texts)) or UNKNOWN
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Table:
-    """Rows of cells under a header: first names, left-aligned, then texts or figures, right-aligned.
+    """Texts in columns below a title: first names, left-aligned, then figures, right-aligned."""
 
-    Rows of one first name are a group where several have it.
-    """
-
-    header: tuple[str, ...]
-    rows: tuple[tuple[object, ...], ...]  # texts and quantities
+    frame: pd.DataFrame
     title: str = ""  # sentence above the table
     names: int = 1  # number of first columns that are names
     label: str = ""  # of the table in LaTeX
+    best: pd.DataFrame | None = None  # which texts are bold in LaTeX
+
+    @classmethod
+    def of(
+        cls, header: Iterable[str], rows: Iterable[Sequence[str]], title: str = "", names: int = 1
+    ) -> Self:
+        return cls(pd.DataFrame([*rows], columns=[*header], dtype=str), title, names)
+
+    def records(self) -> list[dict[str, str]]:
+        """Return the rows as texts by the names of their columns."""
+        return [*self.frame.to_dict("records")]
 
     @property
-    def groups(self) -> tuple[int, ...]:
-        """Numbers of the rows at which a new group begins."""
-        starts = (k for k in range(1, len(self.rows)) if self.rows[k][0] != self.rows[k - 1][0])
-        return tuple(starts) if len({row[0] for row in self.rows}) < len(self.rows) else ()
-
-    def parts(self, width: int) -> list[Self]:
-        """Return tables of at most `width` characters, each with the names and some of the other columns."""
-        border = 3  # characters between two columns
-        columns = zip(self.header, *self.rows, strict=True)
-        needed = [max(len(str(cell)) for cell in column) + border for column in columns]
-        shared = sum(needed[: self.names]) + 1
-        parts: list[list[int]] = [[]]
-        for number in range(self.names, len(self.header)):
-            if parts[-1] and shared + sum(needed[k] for k in (*parts[-1], number)) > width:
-                parts.append([])
-            parts[-1].append(number)
-        return [self._only([*range(self.names), *part]) for part in parts]
-
-    def _only(self, columns: Sequence[int]) -> Self:
-        rows = (tuple(row[k] for k in columns) for row in self.rows)
-        return replace(self, header=tuple(self.header[k] for k in columns), rows=tuple(rows))
+    def tidy(self) -> pd.DataFrame:
+        """Row for each figure: its row and column in the table, its value and half width."""
+        name, *columns = self.frame
+        rows = []
+        for row, column in ((row, column) for row in self.records() for column in columns):
+            value, _, half = row[column].removeprefix(UNKNOWN).partition(" ± ")
+            rows.append((row[name], column, value, half))
+        return pd.DataFrame(rows, columns=[name, "column", "value", "half_width"])
 
     def rich(self) -> RichTable:
         """Return the table for a terminal, without its title; units in brackets aren't taken for markup."""
         table = RichTable()
-        for number, name in enumerate(self.header):
+        for number, name in enumerate(self.frame):
             table.add_column(Text(name), justify="left" if number < self.names else "right")
-        for number, row in enumerate(self.rows):
-            table.add_row(*(Text(str(cell)) for cell in row), end_section=number + 1 in self.groups)
+        for row in self.frame.itertuples(index=False):
+            table.add_row(*map(Text, row))
         return table
 
-    def records(self) -> list[dict[str, str]]:
-        """Return the rows as texts by the names of their columns."""
-        return [dict(zip(self.header, map(str, row), strict=True)) for row in self.rows]
-
-    def tidy(self) -> pd.DataFrame:
-        """Return a row for each figure: its row and column in the table, its value and half width."""
-        figures = [
-            (row[0], column, *(cell.texts if isinstance(cell, Quantity) else (cell, "")))
-            for row in self.rows
-            for column, cell in zip(self.header[1:], row[1:], strict=True)
-        ]
-        return pd.DataFrame(figures, columns=[self.header[0], "column", "value", "half_width"])
-
-    def text(self) -> str:
-        """Return the table for a text file: its title, and columns aligned by blanks."""
-        return f"{self._above}{self._formatted('simple')}\n"
-
-    def markdown(self) -> str:
-        return f"{self._above}{self._formatted('pipe')}\n"
+    def text(self, form: str = "txt") -> str:
+        """Return the table for a file of this suffix, by `FORMS`, or as LaTeX."""
+        if form == "tex":
+            return self.latex()
+        sides = ["left"] * self.names + ["right"] * (self.frame.shape[1] - self.names)
+        frame = self.frame.replace(r"\|", r"\|", regex=True) if form == "md" else self.frame
+        how: dict[str, Any] = {"tablefmt": FORMS[form], "colalign": sides, "disable_numparse": True}
+        above = f"{self.title}\n\n" if self.title else ""
+        return f"{above}{frame.to_markdown(index=False, **how)}\n"
 
     def latex(self) -> str:
         """Return a `table` environment in LaTeX, with the title as its caption; it needs booktabs."""
+        shown = self.frame.style.hide(axis=0).format(escape="latex").format_index(escape="latex", axis=1)
+        if self.best is not None:
+            bold = self.best.map({True: "textbf:--rwrap", False: ""}.get)
+            shown = shown.apply(lambda _: bold, axis=None)
         caption = "".join(LATEX_ESCAPE_RULES.get(character, character) for character in self.title)
-        begin = ["% \\usepackage{booktabs}", r"\begin{table}", r"\centering", rf"\caption{{{caption}}}"]
-        begin += [rf"\label{{{self.label}}}"] if self.label else []
-        return "\n".join([*begin, self._formatted("latex_booktabs"), r"\end{table}", ""]).translate(_UNICODE)
+        sides = "l" * self.names + "r" * (self.frame.shape[1] - self.names)
+        above = {"caption": caption, "label": self.label or None, "position_float": "centering"}
+        text = shown.to_latex(hrules=True, column_format=sides, **above)
+        return f"% \\usepackage{{booktabs}}\n{text}".translate(_UNICODE)
 
     def write(self, folder: Path, name: str, *suffixes: str) -> None:
         """Write the table to a folder as `txt`, `md` or `tex`."""
         for suffix in suffixes:
-            write_text(folder / f"{name}.{suffix}", FORMS[suffix](self))
-
-    @property
-    def _above(self) -> str:
-        return f"{self.title}\n\n" if self.title else ""
-
-    def _formatted(self, style: str) -> str:
-        rows: list[Sequence[str] | str] = []
-        for number, row in enumerate(self.rows):
-            rows += [SEPARATING_LINE] * (style == "latex_booktabs" and number in self.groups)
-            rows.append([_cell(cell, style) for cell in row])
-        sides = ["left"] * self.names + ["right"] * (len(self.header) - self.names)
-        text = str(tabulate(rows, self.header, tablefmt=style, colalign=sides, disable_numparse=True))
-        for mark, bold in zip(_MARKS, _BOLD.get(style, ()), strict=False):
-            text = text.replace(mark, bold)
-        return text
+            write_text(folder / f"{name}.{suffix}", self.text(suffix))
 
 
-def _cell(cell: object, style: str) -> str:
-    text = str(cell).replace("|", r"\|") if style == "pipe" else str(cell)
-    return text.join(_MARKS) if style in _BOLD and isinstance(cell, Quantity) and cell.is_best else text
+# --- tables of results -----------------------------------------------------------------------------------
 
 
-FORMS: Final[Mapping[str, Callable[[Table], str]]] = {
-    "txt": Table.text,
-    "md": Table.markdown,
-    "tex": Table.latex,
-}
-"""Forms of a table by the suffix of its file."""
+def mean(key: str, runs: pd.DataFrame) -> str:
+    """Return the mean of a metric over the tracks of runs with its interval, or its root mean square."""
+    metric, values = METRICS[key], runs[key].astype(float) if key in runs else pd.Series(dtype=float)
+    if metric.average == "rms":
+        return metric.text(metric.over(values))
+    if len(values):
+        values = by_track(runs.assign(**{key: values}).set_index("track")[key].dropna())
+    return estimate(values).text(metric.digits, metric.factor)
 
 
-# --- tables of studies ---------------------------------------------------------------------------------
+def by_metric(parts: Mapping[str, pd.DataFrame], keys: Sequence[str]) -> Table:
+    """Return a row for each metric, and a column for each part of the runs."""
+    rows = ((METRICS[key].heading, *(mean(key, runs) for runs in parts.values())) for key in keys)
+    return Table.of(("metric", *parts), rows)
 
 
-def summary_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
-    """Return a table for each metric of the study that its runs have."""
-    several, tables = names_of(frame, "variant"), []
-    for metric in (METRICS[key] for key in study.metrics if key in frame):
-        rows = []
-        for contrast in contrasts(study, frame, metric.key):
-            names, difference = (getattr(contrast, name) for name in several), contrast.difference
-            by = "baseline" if difference is None else _mean(metric, difference, "+")
-            tested = (_p(contrast.p), _p(contrast.wilcoxon), "*" if contrast.significant else "")
-            rows.append((*names, str(contrast.runs), _mean(metric, contrast.value), by, *tested))
-        header = (*several, "runs", "mean", "difference", "p", "Wilcoxon", "")
-        tables.append(Table(header, tuple(rows), metric.heading, names=len(several)))
-    return tables
+def by_name(frame: pd.DataFrame, names: Sequence[str], keys: Sequence[str]) -> Table:
+    """Return the last laps of the runs, with a row for each value of the columns `names`."""
+    parts = parts_of(frame, names).items()
+    rows = ((label, *(mean(key, runs) for key in keys)) for label, runs in parts)
+    return Table.of((", ".join(names), *(METRICS[key].heading for key in keys)), rows)
+
+
+def parts_of(frame: pd.DataFrame, names: Sequence[str]) -> dict[str, pd.DataFrame]:
+    """Return the last lap of each run, by the values of some columns."""
+    groups = last_laps(frame).groupby([*names], sort=False)
+    return {", ".join(map(str, values)): runs for values, runs in groups}
+
+
+# --- tables of studies -----------------------------------------------------------------------------------
 
 
 def names_of(frame: pd.DataFrame, otherwise: str) -> list[str]:
@@ -218,28 +155,74 @@ def results_table(
     is bold, where a metric has a best.
     """
     shown = [METRICS[key] for key in keys or study.metrics if key in frame]
-    several = names_of(frame, "estimator")
-    columns = [contrasts(study, frame, metric.key) for metric in shown]
-    rows = []
-    for of_row in zip(*columns, strict=True):
-        means = (_mean(METRICS[one.metric], one.value) for one in of_row)
-        best = (_is_best(one, column) for one, column in zip(of_row, columns, strict=True))
-        cells = (replace(mean, is_best=is_best) for mean, is_best in zip(means, best, strict=True))
-        rows.append((*(getattr(of_row[0], name) for name in several), *cells))
-    header = (*several, *(metric.heading for metric in shown))
+    names, rows, best = names_of(frame, "estimator"), dict[str, list[str]](), dict[str, list[bool]]()
+    for metric in shown:
+        column = contrasts(study, frame, metric.key)
+        rows |= {name: [getattr(one, name) for one in column] for name in names}
+        rows[metric.heading] = [_mean(metric, one.value) for one in column]
+        sign = (metric.key in LOWER) - (metric.key in HIGHER)
+        means = pd.Series([sign * one.value.mean for one in column])
+        of_noise = means.groupby([one.noise for one in column])
+        differs = (of_noise.transform("nunique") > 1) & bool(sign)
+        best[metric.heading] = (differs & (means == of_noise.transform("min"))).tolist()
+    texts = pd.DataFrame(rows)
     title = f"{_about(study)} Mean and {_interval(frame)}{_laps(study)}."
-    return Table(header, tuple(rows), title, len(several), label)
+    bold = pd.DataFrame(best).reindex(columns=texts.columns, fill_value=False)
+    return Table(texts, title, len(names), label, bold)
 
 
-def _mean(metric: Metric, of: Estimate, sign: str = "") -> Quantity:
-    return Quantity.estimated(of, max(metric.digits, MEAN_DIGITS), metric.factor, sign)
+def summary_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
+    """Return a table for each metric of the study that its runs have: each combination by the baseline."""
+    names, tables = names_of(frame, "variant"), []
+    for metric in (METRICS[key] for key in study.metrics if key in frame):
+        rows = []
+        for one in contrasts(study, frame, metric.key):
+            by = "baseline" if one.difference is None else _mean(metric, one.difference, "+")
+            tested = (_p(one.p), _p(one.wilcoxon), "*" if one.significant else "")
+            rows.append(
+                (*(getattr(one, n) for n in names), str(one.runs), _mean(metric, one.value), by, *tested)
+            )
+        header = (*names, "runs", "mean", "difference", "p", "Wilcoxon", "")
+        tables.append(Table.of(header, rows, metric.heading, len(names)))
+    return tables
 
 
-def _is_best(one: Contrast, column: Sequence[Contrast]) -> bool:
-    """Whether the mean of a combination is the best of those of its noise, where they differ."""
-    sign = (one.metric in LOWER) - (one.metric in HIGHER)
-    means = [sign * of.value.mean for of in column if of.noise == one.noise and of.value.count]
-    return bool(sign and len(set(means)) > 1) and sign * one.value.mean <= min(means)
+def contrast_table(study: Study, frame: pd.DataFrame) -> Table:
+    """Return each combination: the first metric of the study, its paired difference and p, and the others."""
+    names, last = names_of(frame, "variant"), last_laps(frame)
+    first, *others = (METRICS[key] for key in study.metrics if key in frame and key not in TIMES)
+    rows = []
+    for one in contrasts(study, frame, first.key):
+        values = [getattr(one, name) for name in names]
+        runs = last[(last[names] == values).all(axis=1)]
+        difference = estimate(one.differences).text(first.digits, first.factor)
+        rest = (mean(other.key, runs) for other in others)
+        rows.append((", ".join(values), mean(first.key, runs), difference, figure(one.p), *rest))
+    headings = (first.heading, "difference", "p", *(other.heading for other in others))
+    return Table.of((", ".join(names), *headings), rows)
+
+
+def track_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
+    """Return a table for each combination, track by track: the metrics of its runs at their last lap."""
+    shown = [METRICS[key] for key in study.metrics if key in frame]
+    header, titles = ("track", "runs", *(metric.heading for metric in shown)), names_of(frame, "estimator")
+    tables = []
+    for _, runs in frame.groupby([*COMBINATION], sort=False):
+        rows = []
+        for track, of in [*runs.groupby("track", sort=False), ("all", runs)]:
+            last, count = last_laps(of), len(of.groupby([*RUN]))
+            values = (metric.text(metric.over(last[metric.key].astype(float))) for metric in shown)
+            rows.append((str(track), f"{len(last)} of {count}", *values))
+        tables.append(Table.of(header, rows, ", ".join(str(runs[name].iloc[0]) for name in titles)))
+    return tables
+
+
+def _mean(metric: Metric, of: Estimate, sign: str = "") -> str:
+    return of.text(max(metric.digits, MEAN_DIGITS), metric.factor, sign)
+
+
+def _p(p: float) -> str:
+    return "" if np.isnan(p) else f"{p:.3f}" if p >= 0.001 else "<0.001"
 
 
 def _about(study: Study) -> str:
@@ -259,10 +242,6 @@ def _interval(frame: pd.DataFrame) -> str:
     return f"{100 * LEVEL:g} % interval ({kind}) over {over}"
 
 
-def _p(p: float) -> str:
-    return "" if np.isnan(p) else f"{p:.3f}" if p >= 0.001 else "<0.001"
-
-
 def caption(study: Study, frame: pd.DataFrame) -> str:
     """Return what the tables show, and how it was tested."""
     base = study.baseline
@@ -279,27 +258,12 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
 
 
 def joined(tables: Sequence[Table], caption: str, form: str) -> str:
-    """Return the tables of a study in a form of `FORMS`, below their caption; in LaTeX each has it."""
+    """Return the tables of a study in a form, below their caption; in LaTeX each has it."""
     if form == "tex":
         return "\n".join(replace(table, title=f"{table.title}. {caption}").latex() for table in tables)
     if form == "md":
         caption, tables = caption.replace("*", r"\*"), [replace(t, title=f"**{t.title}**") for t in tables]
-    return "\n".join([caption + "\n", *(FORMS[form](table) for table in tables)])
-
-
-def track_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
-    """Return a table for each combination, track by track: the metrics of its runs at their last lap."""
-    shown = [METRICS[key] for key in study.metrics if key in frame]
-    header, titles = ("track", "runs", *(metric.heading for metric in shown)), names_of(frame, "estimator")
-    tables = []
-    for _, runs in frame.groupby([*COMBINATION], sort=False):
-        rows = []
-        for track, of in [*runs.groupby("track", sort=False), ("all", runs)]:
-            last, count = last_laps(of), len(of.groupby([*RUN]))
-            values = (Quantity.measured(m, m.over(last[m.key].astype(float))) for m in shown)
-            rows.append((str(track), f"{len(last)} of {count}", *values))
-        tables.append(Table(header, tuple(rows), ", ".join(str(runs[name].iloc[0]) for name in titles)))
-    return tables
+    return "\n".join([caption + "\n", *(table.text(form) for table in tables)])
 
 
 # --- files of studies ------------------------------------------------------------------------------------
@@ -309,9 +273,26 @@ def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Write results, times, figures and the summary in three forms, and return the text of the summary."""
     write_results(frame, out)
     tables, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
-    for form in FORMS:
+    for form in ("txt", "md", "tex"):
         write_text(out / f"summary.{form}", joined(tables, note, form))
     results_table(study, frame).write(out, "table", "tex")
-    figure = plot_differences(study, frame)
-    save_figures(out / "figures", {} if figure is None else {"differences": figure})
+    save_figures(out / "figures", {"differences": plot_differences(study, frame)})
     return joined(tables, note, "txt")
+
+
+def write_results(frame: pd.DataFrame, out: Path) -> None:
+    """Write the results, and apart from them how long they took, and where and when they were made."""
+    write_csv(out / "results.csv", without_times(frame))
+    times = [name for name in (*TIMES, *MADE) if name in frame]
+    write_csv(out / "times.csv", frame[["study", *RUN_OF, "lap", *times]])
+
+
+def without_times(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns that are the same whenever the study is run."""
+    return frame.drop(columns=[*TIMES, *MADE], errors="ignore")
+
+
+def write_csv(file: Path, frame: pd.DataFrame) -> None:
+    """Write a frame without its index, whole or not at all."""
+    with replacing(file) as temporary:
+        frame.to_csv(temporary, index=False, lineterminator="\n")

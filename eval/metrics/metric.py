@@ -1,7 +1,9 @@
 """The metrics: their names, units and averages."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import repeat
+from math import isfinite, nan
 from typing import Final, Literal
 
 import numpy as np
@@ -11,7 +13,6 @@ from .accuracy import root_mean_square
 
 FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3, "°": float(np.rad2deg(1.0)), "mrad/s": 1e3}
 """Factors from the shares, bytes and radians of the columns to the units of the tables."""
-MEAN_DIGITS: Final = 2  # least number of digits after the decimal point of a mean with its interval
 UNKNOWN: Final = "–"
 
 
@@ -44,8 +45,21 @@ class Metric:
             return float("nan")
         return root_mean_square(known) if self.average == "rms" else float(np.mean(known))
 
-    def text(self, value: float) -> str:
-        return UNKNOWN if np.isnan(value) else f"{self.factor * value:.{self.digits}f}"
+    def text(self, value: float, half: float = nan) -> str:
+        """Return a value in the unit of the tables, with half the width of its interval."""
+        return figure(self.factor * value, self.factor * half, self.digits)
+
+
+def figure(value: float, half: float = nan, digits: int = 3, sign: str = "") -> str:
+    """Return a value and half the width of its interval, `0.165 ± 0.036`, as far as they are known."""
+    texts = f"{value:{sign}.{digits}f}", f"{half:.{digits}f}"
+    return " ± ".join(text for x, text in zip((value, half), texts, strict=True) if isfinite(x)) or UNKNOWN
+
+
+def figures(values: Iterable[float], *digits: int) -> list[str]:
+    """Return values without intervals, each with its own digits, or all with the same."""
+    every = digits if len(digits) > 1 else repeat(*digits)
+    return [figure(value, digits=k) for value, k in zip(values, every, strict=False)]
 
 
 PAPER: Final = (

@@ -10,8 +10,8 @@ from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
 from pathspace_graph.eval.experiment import compare as experiment
-from pathspace_graph.eval.experiment.cells import run_estimator
 from pathspace_graph.eval.experiment.compare import Comparison, compare, side_by_side
+from pathspace_graph.eval.experiment.run import run_estimator
 from pathspace_graph.eval.experiment.runner import check_jobs, unfinished, workers
 from pathspace_graph.eval.figures.map_plot import plot_map
 from pathspace_graph.eval.figures.style import save_plot
@@ -58,8 +58,7 @@ def report(out: Path, comparison: Comparison) -> Outcome:
     printed = {name: table for name, table in experiment.tables(comparison).items() if name != "metrics"}
     for table in printed.values():
         console.print(table.title, highlight=False, markup=False)
-        for part in table.parts(console.width):
-            console.print(part.rich())
+        console.print(table.rich())
     note(*(f"{_name(run)}: not converged" for run in comparison.unsettled))
     wrong = [f"{_name(run)}: failed, {run['error']}" for run in comparison.failures]
     return Outcome([out], {name: table.records() for name, table in printed.items()}, wrong)
@@ -85,7 +84,7 @@ def demo_command(options: Demo) -> Outcome:
         picture = plot_map(result.map, log=log, trajectory=result.trajectory, smoothed=result.smoothed)
         save_plot(picture, folder / PICTURE, PICTURE_DPI)
     table = side_by_side({run.estimator: laps_of(run, log) for run in (result, rival)})
-    if table.rows:
+    if len(table.frame):
         output().print(table.rich())
     say(outline(result))
     say(*not_mapped(result.map, log), f"log, map and {PICTURE}:")

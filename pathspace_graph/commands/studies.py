@@ -10,9 +10,7 @@ import pandas as pd
 from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import ONLINE, check_online
-from pathspace_graph.eval.benchmark import scaling as timing
-from pathspace_graph.eval.benchmark.roads import QUICK, make_drives
-from pathspace_graph.eval.benchmark.scaling import measure_scaling
+from pathspace_graph.eval import benchmark
 from pathspace_graph.eval.experiment.drives import log_folders
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
 from pathspace_graph.eval.experiment.run import make_plan, run_plan
@@ -76,17 +74,18 @@ def scale_command(options: Scale) -> Outcome:
         check_online(name, "--estimators")
     if options.quick and options.scaling != ScalingSettings():
         raise SettingsError("--quick: expected no other --scaling options with it, found some")
-    check_target(options.out, timing.MARKER, force=options.force)
-    measured = QUICK if options.quick else options.scaling
+    check_target(options.out, benchmark.MARKER, force=options.force)
+    measured = benchmark.QUICK if options.quick else options.scaling
     with progress("simulating"):
-        drives = make_drives(measured)
+        drives = benchmark.make_drives(measured)
+    cycles = sum(sweep.cycles for sweep in drives.values())
     with unfinished(options.out) as folder:
-        with progress("timing", drives.cycles, lines=LINES) as advance:
-            scaling = measure_scaling(names, drives, measured, options.settings, folder, advance)
-        timing.write_scaling(options.out, scaling, force=options.force)
-    table = timing.scaling_table(scaling)
+        with progress("timing", cycles, lines=LINES) as advance:
+            scaling = benchmark.measure_scaling(names, drives, measured, options.settings, folder, advance)
+        benchmark.write_scaling(options.out, scaling, force=options.force)
+    table = benchmark.scaling_table(scaling)
     output(wide=True).print(table.rich())
-    say(*timing.stops(scaling))
+    say(*benchmark.stops(scaling))
     return Outcome([options.out], {"slopes": table.records()})
 
 

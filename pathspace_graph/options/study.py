@@ -92,8 +92,7 @@ class Scale(Estimation, FolderCommand):
     """Time every online estimator on ever larger maps and more and more detections, and draw the slopes.
 
     All run in this one process, cycle for cycle in turn, so that other work of the machine slows all of them
-    alike. An estimator that takes longer than the budget is stopped there, and the table says so. Memory is
-    measured by tracemalloc, for Python and numpy, while the first lap of the closed road is mapped. Finished
+    alike. An estimator that takes longer than the budget is stopped there, and the table says so. Finished
     sweeps are kept in `OUT.unfinished` until all are there, so that the same command goes on where it was
     killed.
     """
@@ -115,7 +114,7 @@ class Report(Command):
 
     The experiments are `accuracy`, `skidpad`, `camera`, `faults`, `hard`, `lines`, `endurance`, `centerline`,
     the ablations `stations`, `gauge`, `robust`, `density`, `lag`, `relinearize`, `degree` and `covariance`,
-    and `hints`, `known`, `joint`, `speed`, `scale` and, with logs, `real`. Each row of a table says by which
+    and `known`, `joint`, `speed`, `scale` and, with logs, `real`. Each row of a table says by which
     command, at which commit, on which machine and when it was measured.
     """
 

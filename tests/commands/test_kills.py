@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.cli import parse, run_command
-from pathspace_graph.eval.experiment.cells import run_estimator
+from pathspace_graph.eval.experiment.run import run_estimator
 from pathspace_graph.eval.metrics.measures import Row
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import atomic_file, atomic_folder

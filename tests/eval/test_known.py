@@ -64,7 +64,7 @@ def test_the_table_has_a_row_for_each_kind_of_map_over_tracks() -> None:
         for track, found, error in ((0, 1.0, 0.1), (0, 0.0, np.nan), (1, 1.0, 0.3))
     ]
     table = known_table(pd.DataFrame(rows))
-    assert table.header[0] == "cars, known map"
+    assert next(iter(table.frame)) == "cars, known map"
     every = table.records()
     assert [row["cars, known map"] for row in every] == [f"plain, {kind} (3 drives)" for kind in (OWN, OTHER)]
     assert every[0]["found [%]"].startswith("75 ±")  # not two thirds: each track counts once

@@ -13,17 +13,14 @@ import pytest
 from pathspace_graph.cli import main
 from pathspace_graph.eval import report
 from pathspace_graph.eval.experiment.faults import at_strength, fault_table, outcomes, suite
+from pathspace_graph.eval.experiment.statistics import estimate
 from pathspace_graph.eval.experiment.study import Study
-from pathspace_graph.eval.experiment.tables import Quantity, Table
-from pathspace_graph.eval.report import CAMERA
-from pathspace_graph.eval.views import (
-    camera_table,
+from pathspace_graph.eval.experiment.tables import Table, by_name, contrast_table
+from pathspace_graph.eval.report import (
+    estimators_table,
     laps_table,
-    metrics_table,
     rmse_table,
-    runs_table,
     skidpad_table,
-    study_table,
     tracks_table,
 )
 
@@ -39,30 +36,32 @@ def frame(estimator: str, laps: int, rmse: float) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+STUDY = Study(tracks=(0,), laps=3, estimators=("fixed-lag", "spline"))
 BOTH = pd.concat([frame("fixed-lag", 3, 0.6), frame("spline", 3, 0.3)], ignore_index=True)
 
 
 def values(table: Table, row: int) -> list[float | None]:
-    return [cell.value for cell in table.rows[row] if isinstance(cell, Quantity)]
+    cells = table.frame.iloc[row, 1:]
+    return [None if cell == "–" else float(cell.partition(" ± ")[0]) for cell in cells]
 
 
 def labels(table: Table) -> list[object]:
-    return [row[0] for row in table.rows]
+    return [*table.frame.iloc[:, 0]]
 
 
 def test_a_figure_is_a_mean_with_its_interval_of_the_known_values() -> None:
     """Of 1, 2, 3 the sample's deviation is 1, and Student's t of 2 degrees is 4.303."""
-    figure = Quantity.of(np.array([1.0, np.nan, 2.0, 3.0]), 1, 100.0)
-    assert figure.value == pytest.approx(200.0)
-    assert figure.half == pytest.approx(100.0 * 4.302653 / np.sqrt(3.0), rel=1e-6)
-    assert str(figure) == "200.0 ± 248.4"
-    assert str(Quantity.of(np.array([2.0]))) == "2.000"
-    assert str(Quantity.of(np.array([np.nan]))) == "–"
+    found = estimate(np.array([1.0, np.nan, 2.0, 3.0]))
+    assert (found.mean, found.count) == (pytest.approx(2.0), 3)
+    assert found.half == pytest.approx(4.302653 / np.sqrt(3.0), rel=1e-6)
+    assert found.text(1, 100.0) == "200.0 ± 248.4"
+    assert estimate(np.array([2.0])).text() == "2.000"
+    assert estimate(np.array([np.nan])).text() == "–"
 
 
 def test_the_table_of_laps_has_the_online_map_and_the_batch() -> None:
-    found = laps_table(BOTH, (1, 2, 3, 3), ("rmse", "missed"))
-    assert found.header == ("metric", "lap 1", "lap 2", "lap 3", "batch")
+    found = laps_table(STUDY, BOTH, (1, 2, 3, 10), ("rmse", "missed"))
+    assert tuple(found.frame) == ("metric", "lap 1", "lap 2", "lap 3", "batch")
     assert labels(found) == ["rmse [m]", "missed [%]"]
     assert values(found, 0) == pytest.approx([0.6, 0.3, 0.2, 0.1])
     assert values(found, 1) == pytest.approx([1.0] * 4)  # in percent
@@ -70,16 +69,16 @@ def test_the_table_of_laps_has_the_online_map_and_the_batch() -> None:
 
 def test_the_tables_of_accuracy_have_tracks_laps_and_metrics() -> None:
     two = pd.concat([BOTH, BOTH.assign(track="other", rmse=2.0 * BOTH["rmse"])], ignore_index=True)
-    found = tracks_table(two)
-    assert found.header[1:4] == ("rmse, lap 1 [m]", "rmse, last lap [m]", "rmse, batch [m]")
+    found = tracks_table(STUDY, two)
+    assert tuple(found.frame)[1:4] == ("rmse, lap 1 [m]", "rmse, last lap [m]", "rmse, batch [m]")
     assert labels(found) == ["t", "other"]
     assert values(found, 1)[:3] == pytest.approx([1.2, 0.4, 0.2])
-    assert all(isinstance(cell, str) or cell.half is None for cell in found.rows[0])
-    found = rmse_table(two)
-    assert found.header == ("rmse after lap [m]", "fixed-lag", "spline")
+    assert not found.frame.map(lambda cell: "±" in cell).any(axis=None)
+    found = rmse_table(STUDY, two)
+    assert tuple(found.frame) == ("rmse after lap [m]", "fixed-lag", "spline")
     assert [values(found, lap)[0] for lap in range(3)] == pytest.approx([0.9, 0.45, 0.3])
-    found = metrics_table(two, ("rmse", "missed_2m"))
-    assert found.header == ("metric", "fixed-lag", "spline")
+    found = estimators_table(STUDY, two, ("rmse", "missed_2m"))
+    assert tuple(found.frame) == ("metric", "fixed-lag", "spline")
     assert values(found, 0) == pytest.approx([0.3, 0.15])
     assert values(found, 1) == [None, None]
 
@@ -90,8 +89,8 @@ def test_a_study_s_table_has_paired_differences_from_its_baseline() -> None:
     study = Study(tracks=(0,), seeds=(0, 1), grids=({"lag": [1.0]},), metrics=metrics)
     runs = frame("fixed-lag", 1, 0.3).assign(noise="nominal", variant="default", ms_mean=1.0)
     worse = runs.assign(variant="lag=1", rmse=runs["rmse"] + 0.1 * (1 + runs["seed"]))
-    found = study_table(study, pd.concat([runs, worse], ignore_index=True))
-    assert found.header == ("variant", "rmse [m]", "difference", "p", "missed [%]")
+    found = contrast_table(study, pd.concat([runs, worse], ignore_index=True))
+    assert tuple(found.frame) == ("variant", "rmse [m]", "difference", "p", "missed [%]")
     assert labels(found) == ["default", "lag=1"]
     assert values(found, 0)[:3] == [0.3, None, None]
     assert found.records()[1]["difference"] == "0.150 ± 0.635"
@@ -99,24 +98,15 @@ def test_a_study_s_table_has_paired_differences_from_its_baseline() -> None:
 
 
 def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
-    assert values(skidpad_table(frame("fixed-lag", 2, 0.6)), 0)[0] == pytest.approx(
-        np.sqrt((1.0 + 4.0) / 2.0)
-    )
-
-
-def test_the_table_of_the_camera_ends_with_the_limit_of_landmarks() -> None:
-    more = {"nees": 1.5, "reported_degraded": 0.25, "map_scale_nees": 0.8}
-    found = camera_table(BOTH.assign(**more), pd.DataFrame({"track": ["t", "t"], "rmse": [0.1, 0.3]}), CAMERA)
-    assert found.header[:3] == ("estimator", "rmse [m]", "rmse without turn and scale [m]")
-    assert labels(found) == ["fixed-lag", "spline", "landmarks, given all"]
-    assert [values(found, row)[0] for row in range(3)] == pytest.approx([0.2, 0.1, 0.2])
-    assert values(found, 0)[-1] == pytest.approx(25.0) and values(found, 2)[-1] is None
+    """Of 1 m and 2 m the rms is that of 2.5 m^2."""
+    found = skidpad_table(STUDY, frame("fixed-lag", 2, 0.6), ("ate", "rmse"))
+    assert values(found, 0)[0] == pytest.approx(np.sqrt(2.5), abs=5e-4)
 
 
 def test_a_table_of_runs_has_a_row_for_each_noise_and_estimator() -> None:
     noises = pd.concat([BOTH.assign(noise=noise) for noise in ("1 m", "4 m")], ignore_index=True)
-    found = runs_table(noises, ("noise", "estimator"), ("rmse", "nees"))
-    assert found.header == ("noise, estimator", "rmse [m]", "NEES per degree of freedom")
+    found = by_name(noises, ("noise", "estimator"), ("rmse", "nees"))
+    assert tuple(found.frame) == ("noise, estimator", "rmse [m]", "NEES per degree of freedom")
     assert labels(found) == ["1 m, fixed-lag", "1 m, spline", "4 m, fixed-lag", "4 m, spline"]
     assert values(found, 3) == [pytest.approx(0.1), None]
 
@@ -134,12 +124,12 @@ def test_the_table_of_faults_is_relative_to_the_clean_run_of_the_middle_strength
     found = fault_table(pair, outcomes(pair, pd.concat(runs, ignore_index=True)))
     assert labels(found) == ["clean", late]
     assert [row["rmse by clean"] for row in found.records()] == ["1.00", "1.50"]
-    assert values(found, 1)[found.header.index("reported [%]") - 1] == 100.0
+    assert values(found, 1)[[*found.frame].index("reported [%]") - 1] == 100.0
 
 
 def test_a_tidy_table_has_a_row_for_each_figure() -> None:
-    table = Table(("metric", "lap 1", "batch"), (("rmse [m]", Quantity(0.5, 0.1, 2), Quantity(None)),))
-    assert table.tidy().to_dict("records") == [
+    table = Table.of(("metric", "lap 1", "batch"), [("rmse [m]", "0.50 ± 0.10", "–")])
+    assert table.tidy.to_dict("records") == [
         {"metric": "rmse [m]", "column": "lap 1", "value": "0.50", "half_width": "0.10"},
         {"metric": "rmse [m]", "column": "batch", "value": "", "half_width": ""},
     ]
@@ -155,7 +145,8 @@ def test_a_report_writes_what_it_measured_and_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of the online estimator alone."""
-    monkeypatch.setattr(report, "ESTIMATORS", ("fixed-lag",))
+    quick = {"quick": {"seeds": [0], "estimators": ["fixed-lag"]}}
+    monkeypatch.setitem(report.STUDIES, "skidpad", report.STUDIES["skidpad"] | quick)
     run = ["report", "--out", str(tmp_path), "--only", "skidpad", "--jobs", "1", "--quick"]
     assert main(run) == 0
     with (tmp_path / "skidpad.csv").open(encoding="utf-8") as lines:

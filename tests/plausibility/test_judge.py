@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from pathspace_graph import hints
-from pathspace_graph.eval.hints import EDITED, causes_of
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.plausibility.judge import positions_in_metres
-from pathspace_graph.sim.mistakes import MISTAKES, in_frame, late, with_points, with_twists
 
 from ..scenes.drives import ahead, corridor, detections, exact_log, short_drive
 from ..scenes.lines import line_drive
+from .good_logs import EDITED, PRESET, SIMULATED, good_log
+from .mistakes import MISTAKES, causes_of, in_frame, late, with_points, with_twists
 
 SAID = {
     "positions in millimetres": ("in millimetres", "multiply x and y by 0.001"),
@@ -89,6 +89,14 @@ def test_good_logs_are_not_accused() -> None:
     colourless = replace(log, cycles=tuple(replace(c, labels=c.labels * 0 + UNKNOWN) for c in log.cycles))
     for good in (log, colourless, *(edit(log) for edit in EDITED.values())):
         assert hints(good) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [*SIMULATED, *PRESET])
+def test_a_good_log_of_any_kind_is_not_accused(kind: str) -> None:
+    """A range of 5 m shows two cones a cycle, which cannot check the odometry: that is said."""
+    expected = ["reach"] if kind == "range of 5 m" else []
+    assert [hint.cause for hint in hints(good_log(0, kind))] == expected
 
 
 def test_the_truth_is_not_read() -> None:

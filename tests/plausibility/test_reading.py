@@ -16,9 +16,9 @@ from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.plausibility.judge import read_plausible_log, refused_hints
 from pathspace_graph.settings.online import LimitSettings
-from pathspace_graph.sim.mistakes import MISTAKES
 
 from ..scenes.drives import short_drive
+from .mistakes import MISTAKES
 
 
 def written(log: Log, folder: Path) -> Path:

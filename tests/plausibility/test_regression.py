@@ -24,9 +24,9 @@ from pathspace_graph.plausibility.regression import (
     register,
     twist_of,
 )
-from pathspace_graph.sim.mistakes import late, speeds_in_the_map, with_twists, with_twists_of
 
 from ..scenes.drives import ahead, corridor, exact_log, short_drive
+from .mistakes import late, speeds_in_the_map, with_twists, with_twists_of
 
 CONES = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0], [2.5, -1.9], [7.0, -2.0], [11.0, -2.1], [14.0, 1.0]])
 STILL = [np.zeros(3)]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pathspace_graph.sim.mistakes import MISTAKES, dead_reckoned, detections_in_the_map, in_frame, late
-
+from ..plausibility.mistakes import MISTAKES, dead_reckoned, detections_in_the_map, in_frame, late
 from ..scenes.batch import course_log
 
 LOG = course_log(0.5)

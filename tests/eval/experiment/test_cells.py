@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.experiment import cells
+from pathspace_graph.eval.experiment import run
 from pathspace_graph.eval.experiment.compare import plan_of
 
 from ...scenes.rings import register, write_logs
@@ -36,7 +36,7 @@ def test_a_failure_of_the_run_and_of_the_measure_are_results(
 
     broken, rings = plan_of(log, ("broken", "rings")).cells
     assert broken.record()["failure"] == "ValueError: lost the way"
-    monkeypatch.setattr(cells, "measure", measure)
+    monkeypatch.setattr(run, "measure", measure)
     found = rings.record()
     assert found["rows"] == [] and "files" not in found
     assert found["failure"] == "SettingsError: two lines"

@@ -96,9 +96,9 @@ def test_a_failure_is_told_and_the_rest_goes_on(folder: Path, tmp_path: Path) ->
         ("b", "broken", "ValueError: lost the way"),
     ]
     assert told == [0, 1, 2, 3, 4] and len(found.frame) == 6
-    assert set(found.times()["stage"]) == {"whole", "guess"}
+    assert set(found.times["stage"]) == {"whole", "guess"}
     table = paper_table(found)
-    assert table.rows[0][:2] == ("broken", "failed")
+    assert [*table.frame.iloc[0, :2]] == ["broken", "failed"]
 
 
 def test_a_comparison_that_was_killed_goes_on(folder: Path, tmp_path: Path) -> None:
@@ -125,10 +125,15 @@ def test_the_paper_s_table_is_the_mean_over_logs(compared: Comparison) -> None:
     assert frame["size"].tolist() == [32, 32, 36, 36]
     # of 40 cones the middle one of three on end is more than 3 m away
     assert frame["missed"].tolist() == pytest.approx([0.0, 0.0, 0.075, 0.075])
-    assert paper_table(compared).header == ("estimator", "lap", "logs", "rmse [m]", "missed [%]", "size")
-    assert paper_table(compared).groups == (2,)
-    cells = paper_table(compared).rows[0][3:]
-    assert [str(cell) for cell in cells] == ["0.100 ± 0.000", "0.0 ± 0.0", "32 ± 0"]
+    assert tuple(paper_table(compared).frame) == (
+        "estimator",
+        "lap",
+        "logs",
+        "rmse [m]",
+        "missed [%]",
+        "size",
+    )
+    assert [*paper_table(compared).frame.iloc[0, 3:]] == ["0.100 ± 0.000", "0.0 ± 0.0", "32 ± 0"]
 
 
 def test_without_truth_only_what_needs_none_is_told(folder: Path, tmp_path: Path) -> None:
@@ -137,12 +142,12 @@ def test_without_truth_only_what_needs_none_is_told(folder: Path, tmp_path: Path
     assert not {"rmse", "missed", "ate", "nees"} & set(found.frame)
     table = tables(found)["table"]
     assert "no true cones" in table.title
-    assert [row[0] for row in table.rows] == [
+    assert [*table.frame["metric"]] == [
         *("size", "loop closed at the end of the log [%]", "crossings of the boundaries"),
         "update, mean [ms]",
     ]
     assert table.records()[0] == {"metric": "size", "rings": "32"}
-    assert {row[0] for row in final_table(found).rows} >= {"size", "map [kB]", "update, mean [ms]"}
+    assert {*final_table(found).frame["metric"]} >= {"size", "map [kB]", "update, mean [ms]"}
 
 
 # --- tables and figures ----------------------------------------------------------------------------------
@@ -151,11 +156,11 @@ def test_without_truth_only_what_needs_none_is_told(folder: Path, tmp_path: Path
 def test_side_by_side_has_a_row_per_lap_and_dashes_where_one_has_fewer() -> None:
     ours = [LapMetrics(1, 0.3, 0.0, 90), LapMetrics(2, 0.2, 0.0, 80)]
     table = side_by_side({"ours": ours, "theirs": [LapMetrics(1, 0.5, 0.125, 160)]})
-    assert [name.split("\n")[0] for name in table.header] == ["lap", "ours", "theirs"]
-    assert [row[0] for row in table.rows] == ["1", "2"]
-    assert str(table.rows[0][2]).split() == ["0.500", "12.5", "160"]
-    assert str(table.rows[1][2]).split() == ["–", "–", "–"]
-    assert side_by_side({"ours": []}).rows == ()
+    assert [name.split("\n")[0] for name in table.frame] == ["lap", "ours", "theirs"]
+    assert [*table.frame["lap"]] == ["1", "2"]
+    assert table.frame.iloc[0, 2].split() == ["0.500", "12.5", "160"]
+    assert table.frame.iloc[1, 2].split() == ["–", "–", "–"]
+    assert side_by_side({"ours": []}).frame.empty
 
 
 def test_maps_are_drawn_over_one_stretch_with_what_they_reach(folder: Path) -> None:

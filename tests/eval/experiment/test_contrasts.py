@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
-from pathspace_graph.eval.experiment.frame import RUN, add_batch, contrasts
 from pathspace_graph.eval.experiment.plots import plot_differences
-from pathspace_graph.eval.experiment.statistics import paired_p
+from pathspace_graph.eval.experiment.run import add_batch
+from pathspace_graph.eval.experiment.statistics import RUN, contrasts, paired_p
 from pathspace_graph.eval.experiment.study import Baseline, Study
 from pathspace_graph.eval.experiment.tables import caption, joined, summary_tables
 from pathspace_graph.eval.figures.style import Picture
@@ -164,8 +164,7 @@ def frame() -> pd.DataFrame:
 def test_tables_tell_the_same_in_every_form(frame: pd.DataFrame) -> None:
     tables, told = summary_tables(STUDY, frame), caption(STUDY, frame)
     assert [table.title for table in tables] == ["rmse [m]", "missed [%]", "size"]
-    assert all(len(row) == len(table.header) for table in tables for row in table.rows)
-    assert len(tables[0].rows) == 6
+    assert len(tables[0].frame) == 6
     assert "Holm" in told
     assert "paired" in told
     text, markdown, latex = (joined(tables, told, form) for form in ("txt", "md", "tex"))
@@ -200,7 +199,13 @@ def test_figures_of_what_differs(frame: pd.DataFrame) -> None:
         "loud_one, lag=1",
         "loud_one, lag=2",
     ]
-    assert plot_differences(STUDY, rows({"default": 0.0})) is None
+
+
+def test_a_study_without_a_comparison_has_its_means_drawn() -> None:
+    drawn = plot_differences(replace(STUDY, grids=(), noise={"nominal": {}}), rows({"default": 0.0}))
+    assert [axes.get_title("left") for axes in drawn.axes] == ["rmse [m]", "missed [%]", "size"]
+    (mean,) = drawn.axes[0].containers[0].lines[0].get_xdata()
+    assert mean == pytest.approx(8.0, abs=0.05)
 
 
 def test_rows_of_all_panels_are_the_same_where_one_metric_lacks_some() -> None:
@@ -208,7 +213,6 @@ def test_rows_of_all_panels_are_the_same_where_one_metric_lacks_some() -> None:
     frame.loc[frame["variant"] == "lag=1", "missed"] = np.nan
     frame.loc[frame["variant"] == "lag=2", "missed"] = 0.5
     drawn = plot_differences(STUDY, frame)
-    assert drawn is not None
     first, second = drawn.axes
     assert [label.get_text() for label in first.get_yticklabels()] == ["nominal, lag=1", "nominal, lag=2"]
     means = [container.lines[0].get_ydata().tolist() for container in second.containers]
@@ -221,7 +225,6 @@ def test_a_figure_names_settings_without_their_group_where_that_is_enough() -> N
 
     def label(study: Study) -> str:
         drawn = plot_differences(study, named)
-        assert drawn is not None
         (panel,) = drawn.axes
         return str(panel.get_yticklabels()[0].get_text())
 

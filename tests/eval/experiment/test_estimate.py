@@ -15,7 +15,7 @@ from pathspace_graph.eval.experiment.statistics import LEVEL, RESAMPLES, estimat
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.eval.metrics.alignment import aligned_distance
 from pathspace_graph.io.files import write_json
-from pathspace_graph.io.log import read_log, write_log
+from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.map import MAP_FILE, Map, map_to_json
 from pathspace_graph.labels import LEFT, RIGHT
 

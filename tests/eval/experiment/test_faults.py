@@ -14,7 +14,6 @@ from pathspace_graph.eval.experiment.faults import (
     beside_clean,
     fault_table,
     outcomes,
-    with_notices,
     write_suite,
 )
 from pathspace_graph.eval.experiment.study import Study
@@ -95,7 +94,7 @@ def test_the_longest_way_astray_is_that_of_the_worst_run(frame: pd.DataFrame) ->
 
 def test_the_table_has_the_cost_of_each_fault_and_what_was_said(frame: pd.DataFrame) -> None:
     found = outcomes(STUDY, frame)
-    clean, mild, strong = with_notices(fault_table(STUDY, found), found).records()
+    clean, mild, strong = fault_table(STUDY, found, notices=True).records()
     cost = ("rmse by clean", "least", "most", "size by clean", "missed [%]", "closed [%]")
     assert [clean[name] for name in cost] == ["1.00", "1.00", "1.00", "1.00", "0.0", "100"]
     assert [mild[name] for name in cost] == ["2.50", "1.50", "3.50", "1.25", "5.0", "100"]

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.errors import InputError, OutputError, SettingsError
 from pathspace_graph.eval.experiment.run import make_plan, run_study
+from pathspace_graph.eval.experiment.runner import locked
 from pathspace_graph.eval.experiment.study import Study, read_study_file, study_from
-from pathspace_graph.eval.experiment.tables import Quantity, results_table, write_study
+from pathspace_graph.eval.experiment.tables import results_table, write_study
 from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.map import read_map
 
@@ -104,13 +105,12 @@ def test_a_study_becomes_a_table_of_a_paper(logs: Path, tmp_path: Path) -> None:
     frame = run_study(study)
     frame.loc[frame["variant"] == "default", "rmse"] = [0.1, 0.3, 0.1, 0.3, 0.2, 0.2]  # 0.2 on each track
     table = results_table(study, frame, ("rmse", "nees"), label="tab:lag")
-    assert table.header == ("variant", "rmse [m]", "NEES per degree of freedom")
+    assert tuple(table.frame) == ("variant", "rmse [m]", "NEES per degree of freedom")
     assert table.records()[0]["rmse [m]"] == "0.200 ± 0.000"
-    bold = [[isinstance(cell, Quantity) and cell.is_best for cell in row[1:]] for row in table.rows]
-    assert bold == [[True, False], [False, False]], "a NEES has no best"
+    assert table.best is not None
+    assert table.best.values.tolist() == [[False, True, False], [False] * 3], "a NEES has no best"
     latex = table.latex()
     assert r"\label{tab:lag}" in latex and r"\textbf{0.200 $\pm$ 0.000}" in latex and latex.isascii()
-    assert "**0.200 ± 0.000**" in table.markdown() and "**" not in table.text()
 
 
 def folder(path: Path) -> Path:
@@ -135,3 +135,41 @@ def test_the_page_goes_from_a_study_to_its_table_and_figures(
     assert (tmp_path / "differences.pdf").stat().st_size > 1000
     assert (tmp_path / "worst.pdf").stat().st_size > 1000
     assert "lag=1" in capsys.readouterr().out
+
+
+def test_the_page_s_script_works_for_a_study_without_a_comparison(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "study.toml"
+    file.write_text(f'tracks = ["{write_round_track(tmp_path)}"]\nlaps = 1\nestimators = ["pretender"]')
+    study = read_study_file(file)
+    write_study(study, run_study(study, tmp_path / "out", keep=True), tmp_path / "out")
+    monkeypatch.chdir(tmp_path)
+    exec(compile(file_blocks(ROOT / "docs" / "ablate.md")["paper.py"], "paper.py", "exec"), {})
+    assert (tmp_path / "differences.pdf").stat().st_size > 1000
+
+
+def test_a_folder_in_which_a_study_runs_is_refused(logs: Path, tmp_path: Path) -> None:
+    study = Study(logs={"ring": (logs / "a",)}, estimators=("pretender",))
+    run_study(study, tmp_path / "out")
+    with locked(tmp_path / "out"), pytest.raises(OutputError, match="no study that runs there"):
+        run_study(study, tmp_path / "out")
+    run_study(study, tmp_path / "out")
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"study.json", "cells"}
+
+
+def test_agreement_is_the_mean_distance_from_the_other_drives(
+    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of three drives whose maps are 1, 2 and 4 m apart: (1 + 2) / 2, (1 + 4) / 2 and (2 + 4) / 2."""
+    write_log(read_log(logs / "a"), logs / "c")
+    apart = iter([1.0, 2.0, 4.0])
+    monkeypatch.setattr("pathspace_graph.eval.experiment.run.aligned_distance", lambda *_: next(apart))
+    ring = tuple(logs / name for name in ("a", "b", "c"))
+    for count, folder in enumerate(ring):  # logs of other contents, or they would be one cell
+        log = read_log(folder)
+        short = replace(log, cycles=log.cycles[: len(log.cycles) - count], truth=None)
+        write_log(short, tmp_path / "own" / folder.name)
+    own = {"ring": tuple(tmp_path / "own" / folder.name for folder in ring)}
+    frame = run_study(Study(logs=own, estimators=("pretender",)), tmp_path / "out", keep=True)
+    assert frame.groupby("drive")["agreement"].last().to_dict() == {"a": 1.5, "b": 2.5, "c": 3.0}

@@ -89,3 +89,12 @@ def test_wilcoxon_by_hand() -> None:
     """Five positive differences: one of 2^5 orders of signs on each side, p = 2 / 32."""
     assert wilcoxon_p(np.array([0.1, 0.2, 0.3, 0.4, 0.5])) == pytest.approx(2.0 / 32.0)
     assert np.isnan(wilcoxon_p(np.zeros(3)))
+
+
+def test_the_bootstrap_studentizes_by_the_deviation_of_a_sample() -> None:
+    """From eight values on: s has n - 1 in its denominator, in the values and in each resample alike."""
+    values = np.array([0.1, 0.4, 0.2, 0.9, 0.3, 0.5, 0.8, 0.6])
+    drawn = values[np.random.default_rng(0).integers(0, 8, (2000, 8))]
+    t = stats.ttest_1samp(drawn[np.ptp(drawn, axis=1) > 0.0], values.mean(), axis=1).statistic
+    half = np.quantile(np.abs(t), 0.95) * stats.sem(values)
+    assert estimate(values).half == pytest.approx(min(half, np.ptp(values)))

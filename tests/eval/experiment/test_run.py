@@ -18,10 +18,10 @@ from pathspace_graph.eval.experiment import drives
 from pathspace_graph.eval.experiment import run as study_run
 from pathspace_graph.eval.experiment import runner as store
 from pathspace_graph.eval.experiment.drives import Drive
-from pathspace_graph.eval.experiment.frame import TIMES, without_times
 from pathspace_graph.eval.experiment.run import run_study
+from pathspace_graph.eval.experiment.statistics import TIMES
 from pathspace_graph.eval.experiment.study import Study
-from pathspace_graph.eval.experiment.tables import write_study
+from pathspace_graph.eval.experiment.tables import without_times, write_study
 from pathspace_graph.io.log import Log
 from pathspace_graph.plausibility.hint import Hint
 

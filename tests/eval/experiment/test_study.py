@@ -192,6 +192,8 @@ def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
     on_disk = {file.stem for file in (ROOT / "eval" / "studies").glob("*.toml")}
     assert set(shipped_studies()) == on_disk
     assert on_disk == {
+        "accuracy",
+        "skidpad",
         "acceleration",
         "batch",
         "camera",
@@ -218,7 +220,7 @@ def test_the_studies_listed_are_the_files_on_disk_and_are_shipped() -> None:
     }
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     shipped = project["tool"]["setuptools"]["package-data"]["pathspace_graph.eval"]
-    assert {"studies/*.toml", "studies/tracks/*.csv"} <= set(shipped)
+    assert {"*.toml", "studies/*.toml", "studies/tracks/*.csv"} <= set(shipped)
 
 
 @pytest.mark.parametrize("file", sorted((SHIPPED / "tracks").iterdir()), ids=lambda file: file.stem)

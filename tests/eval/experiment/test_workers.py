@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.experiment.frame import without_times
 from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.runner import WorkerDiedError, outcomes, workers
 from pathspace_graph.eval.experiment.study import Study
+from pathspace_graph.eval.experiment.tables import without_times
 
 from ...scenes.pretenders import write_round_track
 

@@ -4,6 +4,8 @@ A fault is what a vehicle does; a mistake is in the file only. Each takes a good
 and leaves the truth as it is.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -15,8 +17,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT
-
-from .vehicle import integrate
+from pathspace_graph.sim.vehicle import integrate
 
 DEGREE: Final = float(np.pi / 180.0)  # a degree in radians
 
@@ -172,3 +173,21 @@ MISTAKES: Final[dict[str, Callable[[Log], Log]]] = {
     ),
 }
 """Mistakes by name."""
+
+
+CAUSES: Final[dict[str, tuple[str, ...]]] = {  # that tell a mistake, by the longest beginning of its name
+    **{name: (name,) for name in ("positions", "speeds", "yaw rate", "y to the right", "stamps")},
+    **{name: (name,) for name in ("odometry", "covariances", "sides", "sensor frame")},
+    "all lengths": ("positions", "speeds"),
+    "bearings": ("unexplained",),
+    "sensor frame: 2 m ahead": ("mounting",),
+    "speeds in the map frame": ("odometry",),
+    "detections in the map frame": ("map frame",),
+    "detections 1 s late": ("clocks",),
+    "all labels": ("labels",),
+}
+
+
+def causes_of(mistake: str) -> tuple[str, ...]:
+    """Return the causes of which one must be named."""
+    return CAUSES[max((begin for begin in CAUSES if mistake.startswith(begin)), key=len)]

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from pathspace_graph.eval.benchmark.roads import (
+from pathspace_graph.eval.benchmark import (
     DENT,
     DENTS,
     GAP,
     LINE_POINTS,
+    ROAD_WIDTH,
     SPARE,
     SWING,
     WAVELENGTH,
-    WIDTH,
     closed_road,
     cones_seen,
     drive_log,
@@ -38,8 +38,8 @@ def test_roads_have_their_gaps_and_width() -> None:
         for row in (track.left, track.right):
             np.testing.assert_allclose(np.linalg.norm(np.diff(row, axis=0), axis=1), gap, rtol=0.06)
         nearest = np.linalg.norm(track.left[:, None] - track.right[None], axis=-1).min(axis=1)
-        assert np.all(nearest >= WIDTH - 0.2)
-        assert np.all(nearest < np.hypot(WIDTH, gap / 2) + 0.5)
+        assert np.all(nearest >= ROAD_WIDTH - 0.2)
+        assert np.all(nearest < np.hypot(ROAD_WIDTH, gap / 2) + 0.5)
     assert len(closed_road(100).cones) == pytest.approx(100, abs=3)
 
 
@@ -101,9 +101,10 @@ def test_thinned_keeps_detections_of_the_cycle(log: Log) -> None:
 
 def test_the_long_drive_ends_when_the_last_cone_is_seen() -> None:
     drives = make_drives(SMALL)
-    assert len(drives.seen) == len(drives.cones.cycles)
-    assert drives.seen[-1] >= SMALL.cones_max > drives.seen[-2]
-    assert set(drives.readings) == set(SMALL.readings)
-    assert len(drives.lap_ends) == SMALL.laps
-    points = [len(cycle.labels) for cycle in drives.line.cycles]
+    (cones,), (laps,), (line,) = (drives[name].parts for name in ("cones", "laps", "line"))
+    assert len(cones.at) == len(cones.log.cycles)
+    assert cones.at[-1] >= SMALL.cones_max > cones.at[-2]
+    assert [part.name for part in drives["readings"].parts] == [f"{k} readings: " for k in SMALL.readings]
+    assert {*np.unique(laps.at)} >= {1.0, 2.0} and len(drives["laps"].edges) == SMALL.laps + 1
+    points = [len(cycle.labels) for cycle in line.log.cycles]
     assert np.mean(points) == pytest.approx(LINE_POINTS, rel=0.1)

@@ -10,10 +10,14 @@ import pytest
 
 from pathspace_graph import cli
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.benchmark.lanes import CONES, DENSE_LINE, LAPS, READINGS
-from pathspace_graph.eval.benchmark.roads import LINE_POINTS, make_drives
-from pathspace_graph.eval.benchmark.scaling import (
+from pathspace_graph.eval.benchmark import (
+    CONES,
+    DENSE_LINE,
+    LAPS,
+    LINE_POINTS,
     MARKER,
+    READINGS,
+    make_drives,
     measure_scaling,
     scaling_table,
     stops,
@@ -29,12 +33,13 @@ pytestmark = pytest.mark.usefixtures("png_only")
 @pytest.mark.slow
 def test_a_small_measurement_end_to_end(tmp_path: Path) -> None:
     drives = make_drives(SMALL)
+    cycles = sum(sweep.cycles for sweep in drives.values())
     told: list[tuple[int, int]] = []
     kept = tmp_path / "kept"
     scaling = measure_scaling(["fixed-lag"], drives, SMALL, None, kept, lambda *of: told.append(of))
-    assert told == [(k, drives.cycles) for k in range(1, drives.cycles + 1)]
+    assert told == [(k, cycles) for k in range(1, cycles + 1)]
     again = measure_scaling(["fixed-lag"], drives, SMALL, None, kept, lambda *of: told.append(of))
-    assert len(told) == drives.cycles, "what was measured is kept"
+    assert len(told) == cycles, "what was measured is kept"
     pd.testing.assert_frame_equal(again.points, scaling.points)
     pd.testing.assert_frame_equal(again.slopes, scaling.slopes)
     assert scaling.of(LAPS, "fixed-lag")["at"].tolist() == [1.0, 2.0]
@@ -42,8 +47,7 @@ def test_a_small_measurement_end_to_end(tmp_path: Path) -> None:
     assert len(scaling.of(CONES, "fixed-lag")) == 4
     (on_line,) = scaling.of(DENSE_LINE, "fixed-lag").to_dict("records")
     assert on_line["at"] == LINE_POINTS
-    assert on_line["cycles"] == len(drives.line.cycles)
-    assert scaling.memory["fixed-lag"] > 0.01
+    assert on_line["cycles"] == drives[DENSE_LINE].cycles
     assert not stops(scaling)
     write_scaling(tmp_path / "out", scaling)
     content = json.loads((tmp_path / "out" / MARKER).read_text())
@@ -52,7 +56,7 @@ def test_a_small_measurement_end_to_end(tmp_path: Path) -> None:
     assert len(pd.read_csv(tmp_path / "out" / "points.csv")) == len(scaling.points)
     names = {"scaling.png", "table.md"}
     assert names <= {file.name for file in (tmp_path / "out").iterdir()}
-    assert scaling_table(scaling).rows[0][0] == "fixed-lag"
+    assert scaling_table(scaling).records()[0]["estimator"] == "fixed-lag"
 
 
 def test_bad_requests_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

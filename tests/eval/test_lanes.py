@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.benchmark import lanes
-from pathspace_graph.eval.benchmark.lanes import JUDGED, Lane, peak_memory, run_lanes
+from pathspace_graph.eval import benchmark
+from pathspace_graph.eval.benchmark import JUDGED, Lane, Part, run_lanes
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 
-def empty_log(cycles: int) -> Log:
+def empty(cycles: int) -> Part:
     """A log without detections."""
     t = 0.1 * np.arange(cycles + 1)
     nothing = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, dtype=int))
-    return Log(
-        Odometry(t, np.zeros((cycles + 1, 3))), tuple(Detections(s, *nothing) for s in t[1:]), np.ones(3)
-    )
+    seen = tuple(Detections(s, *nothing) for s in t[1:])
+    return Part(Log(Odometry(t, np.zeros((cycles + 1, 3))), seen, np.ones(3)), np.ones(cycles))
 
 
 @dataclass
@@ -51,7 +50,7 @@ def pretend(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
         def make(name: str, settings: MapperSettings, log: Log) -> Any:
             return Pretender(name, calls, fails_at=fails_at.get(name, 10**9))
 
-        monkeypatch.setattr(lanes, "make_online", make)
+        monkeypatch.setattr(benchmark, "make_online", make)
         return calls
 
     return put
@@ -59,7 +58,7 @@ def pretend(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
 
 def test_every_lane_gets_each_cycle_and_the_first_one_changes(pretend: Callable[..., list[str]]) -> None:
     calls = pretend()
-    times = [Lane(name, empty_log(5)) for name in "abc"]
+    times = [Lane(name, empty(5)) for name in "abc"]
     run_lanes(times, MapperSettings(), budget=10.0)
     assert "".join(calls) == "abcbcacababcbca"
     assert all(len(t.seconds) == len(t.sizes) == 5 and not t.stopped for t in times)
@@ -68,7 +67,7 @@ def test_every_lane_gets_each_cycle_and_the_first_one_changes(pretend: Callable[
 
 def test_a_lane_ends_with_its_log(pretend: Callable[..., list[str]]) -> None:
     calls, told = pretend(), []
-    short, long = Lane("a", empty_log(2)), Lane("b", empty_log(4))
+    short, long = Lane("a", empty(2)), Lane("b", empty(4))
     run_lanes([short, long], MapperSettings(), 10.0, lambda: told.append(1))
     assert (len(short.seconds), len(long.seconds), len(told)) == (2, 4, 4)
     assert "".join(calls) == "abbabb"
@@ -77,7 +76,7 @@ def test_a_lane_ends_with_its_log(pretend: Callable[..., list[str]]) -> None:
 
 def test_one_that_is_too_slow_or_fails_stops_alone(pretend: Callable[..., list[str]]) -> None:
     pretend(b=4)
-    log = empty_log(20)
+    log = empty(20)
     good, bad, slow = Lane("a", log), Lane("b", log), Lane("a", log)
     run_lanes([good, bad], MapperSettings(), budget=10.0)
     assert len(good.seconds) == 20
@@ -87,18 +86,3 @@ def test_one_that_is_too_slow_or_fails_stops_alone(pretend: Callable[..., list[s
     run_lanes([slow], MapperSettings(), budget=1e-12)
     assert len(slow.seconds) == JUDGED
     assert "over 1e-12 s" in slow.stopped
-
-
-def test_memory_is_what_an_estimator_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An estimator that takes one megabyte in each of three cycles."""
-
-    @dataclass
-    class Greedy(Pretender):
-        held: list[np.ndarray] = field(default_factory=list)
-
-        def update(self, odometry: object, detections: object) -> Pretender:
-            self.held.append(np.zeros(125_000))
-            return self
-
-    monkeypatch.setattr(lanes, "make_online", lambda *_: Greedy("a", []))
-    assert peak_memory(Lane("a", empty_log(3)), MapperSettings()) == pytest.approx(3.0, abs=0.2)

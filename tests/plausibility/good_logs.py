@@ -1,41 +1,22 @@
-"""The study of hints: of how many spoiled logs is the cause named, and which good logs are accused?
+"""Good logs of many kinds: what is unusual about them is no mistake."""
 
-Good logs of all kinds are judged: what is unusual about them is no mistake.
-"""
+from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import product
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import pandas as pd
 
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.overrides import Overrides, override
 from pathspace_graph.labels import LEFT
-from pathspace_graph.plausibility.judge import hints
-from pathspace_graph.sim.mistakes import MISTAKES, with_cycles
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
 from pathspace_graph.sim.simulate import preset, simulate
+from pathspace_graph.sim.track_generator import generate_track
 
-from .cars import generated
-from .experiment.tables import Quantity, Table
+from .mistakes import with_cycles
 
-Row = dict[str, Any]
-
-CAUSES: Final[dict[str, tuple[str, ...]]] = {  # that tell a mistake, by the longest beginning of its name
-    **{name: (name,) for name in ("positions", "speeds", "yaw rate", "y to the right", "stamps")},
-    **{name: (name,) for name in ("odometry", "covariances", "sides", "sensor frame")},
-    "all lengths": ("positions", "speeds"),
-    "bearings": ("unexplained",),
-    "sensor frame: 2 m ahead": ("mounting",),
-    "speeds in the map frame": ("odometry",),
-    "detections in the map frame": ("map frame",),
-    "detections 1 s late": ("clocks",),
-    "all labels": ("labels",),
-}
-AS_SIMULATED: Final = "as simulated"  # kind of good logs with nothing unusual
 _SENSOR, _ODOMETRY = SensorSettings(), OdometryNoise()
 _NOISY: Final = {
     **{f"sensor.{name}": 3.0 * getattr(_SENSOR, name) for name in ("range_sigma", "range_sigma_growth")},
@@ -44,7 +25,7 @@ _NOISY: Final = {
     **{f"odometry.{name}": 3.0 * getattr(_ODOMETRY, name) for name in ("scale", "gyro_bias")},
 }
 SIMULATED: Final[dict[str, Overrides]] = {  # kinds of good logs, by what is unusual about their simulation
-    AS_SIMULATED: {},
+    "as simulated": {},
     **{f"field of view of {degrees} degrees": {"sensor.fov": np.deg2rad(degrees)} for degrees in (180, 360)},
     **{f"range of {metres:g} m": {"sensor.range_max": metres} for metres in (5.0, 8.0, 20.0)},
     "noise times 3": _NOISY,
@@ -114,42 +95,5 @@ def good_log(track: int, kind: str) -> Log:
     """Return the good log of a kind; each drawn car is another one."""
     settings = override(replace(preset(PRESET.get(kind, {})), laps=1), SIMULATED.get(kind, {}), "")
     seed = track + 3 * list(SIMULATED).index(kind) if settings.draw else 0
-    log = simulate(generated(track), settings, seed)
+    log = simulate(generate_track(np.random.default_rng(track)), settings, seed)
     return EDITED[kind](log) if kind in EDITED else log
-
-
-def parts_of(tracks: Sequence[int], mistakes: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the arguments of `judge`: good logs of all kinds, of which the plain ones are spoiled too."""
-    return [
-        {"track": track, "kind": kind, "mistakes": mistakes if kind == AS_SIMULATED else ()}
-        for track, kind in product(tracks, (*SIMULATED, *PRESET, *EDITED))
-    ]
-
-
-def judge(track: int, kind: str, mistakes: Sequence[str]) -> list[Row]:
-    """Return a row for the good log of a kind, and for each of those that are spoiled by mistakes."""
-    log = good_log(track, kind)
-    spoiled = [{"name": name, **judged(MISTAKES[name](log), causes_of(name))} for name in mistakes]
-    rows = [{"kind": "good", "name": kind, **judged(log)}, *({"kind": "spoiled", **row} for row in spoiled)]
-    return [{"track": track, **row} for row in rows]
-
-
-def causes_of(mistake: str) -> tuple[str, ...]:
-    """Return the causes of which one must be named."""
-    return CAUSES[max((begin for begin in CAUSES if mistake.startswith(begin)), key=len)]
-
-
-def judged(log: Log, causes: Sequence[str] = ()) -> Row:
-    """Return what is said of a log, and whether one of the causes is named."""
-    found = [hint.cause for hint in hints(log)]
-    is_named = any(cause in found for cause in causes)
-    return {"accused": bool(found), "named": is_named, "causes": "; ".join(found)}
-
-
-def hints_table(rows: pd.DataFrame) -> Table:
-    """Return the number of logs whose cause is named, for each mistake, or that are accused."""
-    spoiled, good = rows[rows["kind"] == "spoiled"], rows[rows["kind"] == "good"]
-    groups = {str(name): of["named"] for name, of in spoiled.groupby("name", sort=False)}
-    groups |= {"all mistakes": spoiled["named"], "good logs, accused of any": good["accused"]}
-    figures = tuple((name, *Quantity.row((hits.sum(), len(hits)), 0)) for name, hits in groups.items())
-    return Table(("mistake", "named", "logs"), figures)

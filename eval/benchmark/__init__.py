@@ -1,1 +1,0 @@
-"""The online mapper's speed, as ratios within one run."""
