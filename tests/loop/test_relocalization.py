@@ -57,7 +57,7 @@ def put_down_on(distance: float) -> tuple[Log, Mapped]:
 @cache
 def clean() -> tuple[Log, FixedLagMapper, list[CycleResult]]:
     log = laps_log(pear_track(), laps=2)
-    return log, *map_log(log, FixedLagMapper(log.noise))
+    return log, *map_log(log, FixedLagMapper(None, log.noise))
 
 
 def apart(log: Log, results: list[CycleResult]) -> Array:
@@ -118,7 +118,7 @@ def test_the_map_does_not_move_while_the_vehicle_is_lost() -> None:
 def test_two_places_that_look_alike_are_not_told_apart() -> None:
     log = put_down(laps_log(pear_track(skew=0.0)), SECOND_LAP, 12.0)
     log = replace(log, cycles=log.cycles[: round(10.0 * (SECOND_LAP + 15.0))])
-    _, results = map_log(log, FixedLagMapper(log.noise))
+    _, results = map_log(log, FixedLagMapper(None, log.noise))
     assert results[-1].health.condition == LOST
     assert FOUND not in {result.notice for result in results}
 

@@ -16,7 +16,6 @@ from pathspace_graph.graph.relative import revisit_rows
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop import revisit as revisit_module
 from pathspace_graph.loop.revisit import Revisits, earlier_pass
-from pathspace_graph.mapping.registration import Matches, Motion, RefinedMotion
 from pathspace_graph.run import CycleResult
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
@@ -90,22 +89,6 @@ def test_what_is_fixed_to_the_vehicle_stays_so_after_a_jump_that_turns(
     np.testing.assert_array_equal(jump, after - before)
     seen = to_vehicle(cone, before[None])
     np.testing.assert_allclose(to_vehicle(move_points(moved[0], cone), after[None]), seen, atol=1e-9)
-
-
-def test_a_place_by_shape_is_less_certain_by_the_bend_of_the_newest_stretch(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The registration is rigid: 1.5 m and 0.15 rad of drift within the stretch are added."""
-    covariance = np.diag([0.04, 0.09, 0.0004]) + 0.001
-    nothing = Matches(np.zeros(0, np.intp), *[np.zeros(0)] * 4, np.zeros((3, 3)), np.zeros(3))  # type: ignore[arg-type]
-    found = RefinedMotion(Motion(np.zeros(2), np.zeros(3)), nothing, covariance)
-    for name, value in (("is_recognizable", True), ("is_lost", True), ("find_place", found)):
-        monkeypatch.setattr(revisit_module, name, lambda *_, known=value: known)
-    smoother = drives.mapped(drives.exact_lap())[0].road.smoother
-    monkeypatch.setattr(smoother, "transform_to_origin", lambda: None)
-    place = revisit_module.recognize(smoother)
-    assert place is not None and place.motion is found.motion
-    np.testing.assert_allclose(place.covariance - covariance, np.diag([2.25, 2.25, 0.0225]), atol=1e-12)
 
 
 # --- the drive of a skidpad ------------------------------------------------------------------------------

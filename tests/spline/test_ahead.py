@@ -145,7 +145,7 @@ def test_nothing_is_known_before_the_first_cycle() -> None:
 )
 def test_lengths_out_of_range_are_refused(distance: float, step: float, message: str) -> None:
     with pytest.raises(SettingsError, match=message):
-        check_line(distance, step, 1.0)
+        check_line(distance, step)
 
 
 def test_a_drive_sees_its_centre_line_and_is_not_changed_by_looking() -> None:

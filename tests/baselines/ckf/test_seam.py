@@ -12,7 +12,7 @@ from pathspace_graph.baselines.periodic import Overlap, find_overlap, make_perio
 from pathspace_graph.settings.mapper import Knots, MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
-from ..scenes.maps import boundary_through
+from ...scenes.maps import boundary_through
 
 Array = NDArray[np.float64]
 

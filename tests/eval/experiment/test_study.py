@@ -238,6 +238,8 @@ def test_every_shipped_study_is_sound_and_listed(name: str) -> None:
     read = read_study_file(find_study(Path(name)))
     assert len(read.tracks) * len(read.seeds) >= {
         "acceleration": 10,
+        "accuracy": 6,
+        "skidpad": 10,
         "hard": 16,
         "lines": 6,
         "faults": 4,
