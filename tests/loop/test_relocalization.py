@@ -135,7 +135,8 @@ def test_the_uncertainty_of_the_position_is_that_of_the_last_step() -> None:
 def test_detections_across_the_infield_are_explained_by_the_map_and_ghosts_are_not() -> None:
     mapper = copied(clean()[1])
     smoother, table = mapper.road.smoother, mapper.road.smoother.map.detections
-    far = np.array([mapper.control_points(LEFT)[k] for k in (5, 12)])
+    left = mapper.boundaries[LEFT].spline(mapper.control_points(LEFT))
+    far = left.evaluate(np.array([20.0, 45.0]))
     ghosts = np.array([[200.0, 0.0], [0.0, 200.0]])
     seen = to_vehicle(np.concatenate([far, ghosts]), np.tile(mapper.poses[-1], (4, 1)))
     rows = table.append(detections(0.0, seen, np.full(4, LEFT)), smoother.next_cycle - 1)
