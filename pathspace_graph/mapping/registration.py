@@ -264,13 +264,6 @@ def worst_sigma(covariance: Array) -> float:
     return sqrt(0.5 * (a + d) + hypot(0.5 * (a - d), b))
 
 
-def sigma_of_information(information: Array) -> float:
-    """`worst_sigma` of an information (3, 3); infinite if a direction is not observed."""
-    if np.linalg.matrix_rank(information) < len(information):
-        return np.inf
-    return worst_sigma(np.asarray(np.linalg.inv(information), np.float64))
-
-
 def agrees(matches: Matches, labels: list[int], settings: ClosingSettings) -> bool:
     """Whether nearly all of enough detections are inliers, on a long stretch of every boundary.
 
