@@ -37,7 +37,6 @@ CELLS: Final = "cells"  # folder of the kept cells
 FORMAT: Final = "pathspace-cell/5"
 FILES: Final = "files"  # key of the files of a run, on their way from its process
 DIGEST: Final = "digest"  # key of a record's digest in its file
-LOCK: Final = ".running"  # file that is locked while a study runs
 CONNECT_SECONDS: Final = 20.0  # time (s) within which a cluster has to answer
 Record = dict[str, Any]  # what is kept of a cell, in the types of JSON only
 OnCell = Callable[[int, int], None]  # called with the numbers of cells that are done, and of all
@@ -189,14 +188,18 @@ def locked(out: Path) -> Iterator[None]:
     The lock of a process ends with it, however it ends. Windows has no such locks.
     """
     out.mkdir(parents=True, exist_ok=True)
-    with (out / LOCK).open("a", encoding="utf-8") as file:
-        if fcntl is not None:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise OutputError(f"{out}: expected no study that runs there, found one") from error
+    if fcntl is None:
         yield
-        (out / LOCK).unlink(missing_ok=True)
+        return
+    folder = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OutputError(f"{out}: expected no study that runs there, found one") from error
+        yield
+    finally:
+        os.close(folder)
 
 
 # --- workers -----------------------------------------------------------------------------------------------

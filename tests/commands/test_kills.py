@@ -128,9 +128,9 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     monkeypatch.setattr("pathspace_graph.eval.figures.style.SUFFIXES", (".png",))
     study, rows = "pathspace_graph.eval.experiment", [Row(1, {"rmse": 0.5}), Row(None, {})]
     monkeypatch.setattr(f"{study}.drives.Drive.load", lambda _: (recorded.log, ()))
-    monkeypatch.setattr(f"{study}.cells.measure", lambda *_, **__: rows)
-    monkeypatch.setattr(f"{study}.cells.stage_times", lambda _: [])
-    monkeypatch.setattr(f"{study}.cells.summarize", lambda *_, **__: {})
+    monkeypatch.setattr(f"{study}.run.measure", lambda *_, **__: rows)
+    monkeypatch.setattr(f"{study}.run.stage_times", lambda _: [])
+    monkeypatch.setattr(f"{study}.run.summarize", lambda *_, **__: {})
     monkeypatch.setattr(f"{study}.runner.made", lambda _: versions() | {"date": "then"})
     monkeypatch.setattr(f"{study}.tables.plot_differences", lambda *_: Figure())
     track = write_round_track(tmp_path)
