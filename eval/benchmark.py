@@ -43,8 +43,7 @@ from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.sim.vehicle import VehicleSettings
 
 from .experiment.provenance import code_of
-from .experiment.run import rows_of
-from .experiment.runner import OnCell
+from .experiment.run import OnCell, rows_of
 from .experiment.tables import Table, write_csv
 from .figures import style
 from .figures.style import MARKERS, PALETTE, WIDTH

@@ -20,12 +20,11 @@ from pathspace_graph.io.map import Map, read_map
 from pathspace_graph.io.results import TRAJECTORY_FILE
 from pathspace_graph.io.tables import read_trajectory
 
-from .experiment.run import EstimatorCell, make_plan, run_records
-from .experiment.runner import Record, run_folder
+from .cars import solve_alone
+from .experiment.run import EstimatorCell, Record, make_plan, run_folder, run_records
 from .experiment.statistics import estimate
 from .experiment.study import Study
 from .experiment.tables import Table
-from .joint import solve_alone
 from .metrics.accuracy import crossings
 from .metrics.alignment import aligned_distance, maps_apart
 from .metrics.metric import UNKNOWN, figure, figures

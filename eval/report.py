@@ -17,18 +17,16 @@ from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.io.parsing import parse_toml, read_text
 from pathspace_graph.settings.evaluation import ScalingSettings
 
-from . import joint, known, real
+from . import cars, real
 from .benchmark import QUICK, SPEED, make_drives, measure_scaling, scaling_table, speed_of_drive
-from .cars import on_tracks
-from .experiment.drives import Drive
 from .experiment.faults import at_strength, fault_table, kinds, only, outcomes
 from .experiment.provenance import made
 from .experiment.run import RowsOf, make_plan, rows_of, run_study
 from .experiment.statistics import RUN_OF, estimate, last_laps
-from .experiment.study import Study, find_study, read_study_file
+from .experiment.study import Drive, Study, find_study, read_study_file
 from .experiment.tables import Table, by_metric, by_name, contrast_table, mean, write_csv
 from .metrics.metric import METRICS, UNKNOWN
-from .metrics.reference import landmark_limit
+from .metrics.reference import landmark_rmse, solve_oracle_landmarks, truth_of
 
 ONLINE, BATCH, LANDMARKS = "fixed-lag", "spline", "landmark-fixed-lag"
 GENERATED: Final = (0, 1, 2)  # seeds of the generated tracks of the benchmark
@@ -75,21 +73,22 @@ class Plan:
             options = {key: value for key, value in wanted.items() if key != "kind"}
             found[part] = KINDS[wanted["kind"]](study, frame, **options)
         if folder.name == "camera":
-            plan = make_plan(study)
-            drives = [d for d in dict.fromkeys(cell.drive for cell in plan.cells) if isinstance(d, Drive)]
-            parts = [{"track": d.track, "settings": d.simulation, "seed": d.own_seed} for d in drives]
-            limit = mean("rmse", self.rows(landmark_limit, parts, folder / "landmarks"))
+            drives = dict.fromkeys(cell.drive for cell in make_plan(study).cells)
+            limits = self.rows(landmark_limit, [{"drive": drive} for drive in drives], folder / "landmarks")
+            limit = mean("rmse", limits)
             frame = found[""].frame
             frame.loc[len(frame)] = ["landmarks, given all", limit, *[UNKNOWN] * (frame.shape[1] - 2)]
         return found
 
     def joint(self, folder: Path) -> Tables:
         tracks, drives = ((50,), 2) if self.quick else ((50, 51, 52), 8)
-        return {"": joint.joint_table(self.rows(joint.of_track, on_tracks(tracks, drives=drives), folder))}
+        parts = cars.on_tracks(tracks, drives=drives)
+        return {"": cars.joint_table(self.rows(cars.joint_of_track, parts, folder))}
 
     def known(self, folder: Path) -> Tables:
         tracks, begins = ((60,), (0.3,)) if self.quick else (range(60, 68), (0.0, 0.3, 0.6))
-        return {"": known.known_table(self.rows(known.of_track, on_tracks(tracks, begins=begins), folder))}
+        parts = cars.on_tracks(tracks, begins=begins)
+        return {"": cars.known_table(self.rows(cars.known_of_track, parts, folder))}
 
     def speed(self, _: Path) -> Tables:
         """Time every estimator in turn on the same cycles."""
@@ -123,6 +122,13 @@ EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Tables]]] = {
     **{"known": Plan.known, "joint": Plan.joint, "speed": Plan.speed, "scale": Plan.scale},
     "real": Plan.real_logs,
 }
+
+
+def landmark_limit(drive: Drive) -> list[dict[str, Any]]:
+    """Return the rmse (m) of the landmark batch that is told all about a drive."""
+    log, _ = drive.load()
+    rmse = landmark_rmse(solve_oracle_landmarks(log)[1], truth_of(log))
+    return [{"track": drive.track, "rmse": rmse}]
 
 
 def smaller(study: Study, parts: Mapping[str, Any]) -> Study:

@@ -1,6 +1,7 @@
 """What made a result: the sources that it depends on, and the libraries, the commit and the machine."""
 
 import ast
+import json
 import os
 import platform
 import sys
@@ -24,6 +25,11 @@ MEASURED: Final = (  # modules on which every result depends, whatever the estim
 )
 NUMERICS: Final = {name: version(name) for name in ("gtsam", "numpy", "scipy")}
 Code = dict[str, str]  # digest of each source by its module, and version of each library by its name
+
+
+def identity(**parts: Any) -> str:
+    """Return a text that is the same for the same values, which are JSON's types only."""
+    return sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:20]
 
 
 def code_of(estimator: str) -> Code:

@@ -1,7 +1,6 @@
 """What is measured of a run: one function measures all metrics, lap by lap and of the whole."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -62,14 +61,11 @@ def covariance_bytes(track: Map) -> int:
     return 8 * sum(boundary.size * (2 * boundary.size + 1) for boundary in track.boundaries.values())
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """Metrics of one lap, or of a whole run."""
+Row = dict[str, Any]
+"""Metrics of a `lap`, or of a whole run, whose lap is None.
 
-    lap: int | None  # number of the lap, from 1; None for the whole run
-    values: dict[str, float]
-    """Values by the metric's key, counts as whole numbers and `closed` as a truth value. Unknown ones, for
-    example without truth, are absent."""
+Counts are whole numbers and `closed` a truth value. Unknown ones, for example without truth, are absent.
+"""
 
 
 def measure(
@@ -84,11 +80,11 @@ def measure(
     row, that of the last lap. `took` is the wall time and the processor time of the whole run (s).
     """
     run, log = run.at_scale_one(), log.at_scale_one()
-    rows = []
+    rows = list[Row]()
     for lap, track, begin, end in _laps(run, log):
-        of_map = _map_values(track, log.truth)
-        rows.append(Row(lap, of_map | _drive_values(run, log.truth, begin, end)))
-    values = _map_values(run.map, log.truth)
+        of_lap = _map_values(track, log.truth) | _drive_values(run, log.truth, begin, end)
+        rows.append({"lap": lap, **of_lap})
+    values: Row = {"lap": None} | _map_values(run.map, log.truth)
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
     values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log.truth)
     if not has_cones(log.truth):
@@ -102,7 +98,7 @@ def measure(
         values |= {"converged": run.converged, "cost": run.cost}
     if took is not None:
         values["seconds"], values["seconds_processor"] = took
-    return [*rows, Row(None, values)]
+    return [*rows, values]
 
 
 def _laps(run: RunResult, log: Log) -> Iterator[tuple[int, Map, float, float]]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from pathspace_graph.eval.joint import joint_table, metrics_of_group, of_track
-from pathspace_graph.sim.simulate import SimulationSettings
+from pathspace_graph.eval.cars import joint_of_track, joint_table, metrics_of_group
 
 from ..batch.joint.several import alone, lap
 
@@ -40,9 +39,9 @@ def test_the_table_compares_each_number_with_half_of_it_track_by_track() -> None
 
 def test_there_is_a_row_for_each_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of four drives there are four maps of one, two of two, and one of all."""
-    monkeypatch.setattr("pathspace_graph.eval.joint.metrics_of_group", lambda logs, _: {"logs": [*logs]})
-    monkeypatch.setattr("pathspace_graph.eval.joint.solve_alone", lambda log: log)
-    monkeypatch.setattr("pathspace_graph.eval.joint.simulate", lambda track, settings, seed: seed)
-    rows = of_track("plain", 4, SimulationSettings(), 4)
+    monkeypatch.setattr("pathspace_graph.eval.cars.metrics_of_group", lambda logs, _: {"logs": [*logs]})
+    monkeypatch.setattr("pathspace_graph.eval.cars.solve_alone", lambda log: log)
+    monkeypatch.setattr("pathspace_graph.eval.cars.drive", lambda car, track, seed: seed)
+    rows = joint_of_track("plain", 4, 4)
     assert [row["drives"] for row in rows] == [1, 1, 1, 1, 2, 2, 4]
     assert [row["logs"] for row in rows[4:]] == [["0", "1"], ["2", "3"], ["0", "1", "2", "3"]]

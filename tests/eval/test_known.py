@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pathspace_graph.eval.known import OTHER, OWN, begun_later, drive_on, known_table, surveyed
+from pathspace_graph.eval.cars import OTHER, OWN, begun_later, drive_on, known_table, surveyed
 from pathspace_graph.eval.metrics.reference import truth_of
 from pathspace_graph.eval.metrics.registration import motion_onto
 from pathspace_graph.factors.se2 import compose, move_points

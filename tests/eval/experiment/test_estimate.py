@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.experiment.run import add_agreement, make_plan
-from pathspace_graph.eval.experiment.runner import run_folder
+from pathspace_graph.eval.experiment.run import add_agreement, make_plan, run_folder
 from pathspace_graph.eval.experiment.statistics import LEVEL, RESAMPLES, estimate
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.eval.metrics.alignment import aligned_distance

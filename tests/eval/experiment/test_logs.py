@@ -9,8 +9,7 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError, OutputError, SettingsError
-from pathspace_graph.eval.experiment.run import make_plan, run_study
-from pathspace_graph.eval.experiment.runner import locked
+from pathspace_graph.eval.experiment.run import locked, make_plan, run_study
 from pathspace_graph.eval.experiment.study import Study, read_study_file, study_from
 from pathspace_graph.eval.experiment.tables import results_table, write_study
 from pathspace_graph.io.log_files import read_log, write_log

@@ -11,13 +11,13 @@ import pytest
 
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.estimators import known_estimators
-from pathspace_graph.eval.experiment.drives import load_tracks
 from pathspace_graph.eval.experiment.run import make_plan
 from pathspace_graph.eval.experiment.study import (
     SHIPPED,
     Baseline,
     Study,
     find_study,
+    load_tracks,
     read_study_file,
     shipped_studies,
     study_from,
