@@ -38,7 +38,7 @@ Tables = dict[str, Table]  # tables of an experiment, by what follows its name; 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class ReportPlan:
     """What is driven; each experiment keeps its runs in a folder, and returns the tables that it measures."""
 
     quick: bool = False  # drive little, to see that everything works
@@ -117,10 +117,15 @@ class Plan:
         return rows_of(function, parts, folder, **self.how)
 
 
-EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Tables]]] = {
-    **dict.fromkeys(STUDIES, Plan.study),
-    **{"known": Plan.known, "joint": Plan.joint, "speed": Plan.speed, "scale": Plan.scale},
-    "real": Plan.real_logs,
+EXPERIMENTS: Final[Mapping[str, Callable[[ReportPlan, Path], Tables]]] = {
+    **dict.fromkeys(STUDIES, ReportPlan.study),
+    **{
+        "known": ReportPlan.known,
+        "joint": ReportPlan.joint,
+        "speed": ReportPlan.speed,
+        "scale": ReportPlan.scale,
+    },
+    "real": ReportPlan.real_logs,
 }
 
 
@@ -143,7 +148,7 @@ def first_variant(study: Study) -> Study:
     return replace(study, grids=grids, variants=dict([*study.variants.items()][:1]))
 
 
-def write_report(plan: Plan, folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Table]]:
+def write_report(plan: ReportPlan, folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Table]]:
     """Run experiments, by default all that the plan has logs for; write and yield each table."""
     for name in names:
         check_name(name, EXPERIMENTS, "--only: expected an experiment")

@@ -18,7 +18,6 @@ from pathspace_graph.eval.benchmark import (
     closed_road,
     cones_seen,
     drive_log,
-    first_cycles,
     make_drives,
     open_road,
     thinned,
@@ -79,12 +78,6 @@ def test_cones_seen_counts_each_once(log: Log) -> None:
     for k in (0, 5, len(seen) - 1):
         so_far = set(log.truth.associations[: ends[k]].tolist()) - {-1}
         assert seen[k] == len(so_far)
-
-
-def test_the_first_cycles_have_no_truth(log: Log) -> None:
-    short = first_cycles(log, 5)
-    assert short.cycles == log.cycles[:5]
-    assert short.truth is None
 
 
 def test_thinned_keeps_detections_of_the_cycle(log: Log) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.consistency import aligned, similarity_from_truth, turn_from_truth
+from pathspace_graph.eval.metrics.consistency import Deviation, aligned, similarity_from_truth
 from pathspace_graph.eval.metrics.measures import measure
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Log, Odometry, Truth
@@ -20,6 +20,11 @@ from .straight_maps import line, row, truth
 Array = NDArray[np.float64]
 
 FAR = (10.0, 50.0, 90.0)
+
+
+def turn_from_truth(track: Map, truth: Truth) -> Deviation:
+    (turn,) = similarity_from_truth(track, truth, 1)
+    return turn
 
 
 def ring(radius: float, angle: float = 0.0) -> SplineBoundary:
@@ -86,9 +91,7 @@ def test_landmarks_that_only_grow_have_no_turn_and_the_scale_s_sigma() -> None:
 def test_the_rmse_without_turn_and_scale_is_that_of_the_shape() -> None:
     true = aligned(ring_truth(), 0.0, -0.03)
     nothing = RunResult("made", {}, rings(0.02), np.zeros(0), np.zeros((0, 3)), (), 0)
-    values = measure(nothing, Log(Odometry(np.zeros(1), np.zeros((1, 3))), (), np.ones(3), truth=true))[
-        0
-    ].values
+    values = measure(nothing, Log(Odometry(np.zeros(1), np.zeros((1, 3))), (), np.ones(3), truth=true))[0]
     assert values["rmse"] > 0.5 and values["rmse_aligned"] == pytest.approx(0.0, abs=1e-4)
     assert values["map_scale"] == pytest.approx(0.03, abs=1e-6)
     assert "map_scale_nees" not in values and "turn_nees" not in values  # without a joint covariance
