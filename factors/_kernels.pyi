@@ -465,14 +465,14 @@ def laid(
     seen: _Cones,
     known: _Cones,
     views: Array,
-    mean: Array,
+    means: Array,
     prior: Array,
     reach: tuple[float, float],
     limits: tuple[float, ...],
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the places where seen cones may lie, as `constellation:lay` compares them.
+    """Return the places where seen cones may lie, as `places.find:find` compares them.
 
-    They are poses (m, 3), the information (m, 3, 3) about each from the cones that lie on others, the sum
-    (m,) of the capped squares of the cones in view, their number (m,), and the square (m,) of the way from
-    the mean.
+    They are poses (m, 3) about the means (k, 3), the information (m, 3, 3) about each from the cones that lie
+    on others, the sum (m,) of the capped squares of the cones in view, their number (m,), and the square (m,)
+    of the way from the mean.
     """

@@ -1,24 +1,48 @@
-// Cones laid on earlier ones (`mapping/constellation.py`).
+// Seen cones laid on known ones (`places/constellation.py`).
 
 #include "common.hpp"
 
 namespace kernels {
 namespace {
 
-struct ConePoints {  // mapping.constellation:Cones
-  explicit ConePoints(const py::tuple& columns)
-      : point(columns[0].cast<Array>()),
-        covariance(columns[1].cast<Array>()),
-        label(columns[2].cast<Ints>()) {
-    n = label.size();
-    expect(point.size() == 2 * n && covariance.size() == 4 * n);
+struct ConePoints {  // places.constellation:Cones
+  ConePoints() = default;
+  explicit ConePoints(const py::tuple& columns) {
+    const auto points = columns[0].cast<Array>(), covariances = columns[1].cast<Array>();
+    const auto labels = columns[2].cast<Ints>();
+    n = labels.size();
+    expect(points.size() == 2 * n && covariances.size() == 4 * n);
+    point.assign(points.data(), points.data() + 2 * n);
+    covariance.assign(covariances.data(), covariances.data() + 4 * n);
+    label.assign(labels.data(), labels.data() + n);
   }
-  Array point, covariance;
-  Ints label;
-  Index n;
+
+  // Those within a radius of a position.
+  ConePoints near(const double* at, double radius) const {
+    ConePoints found;
+    for (Index i = 0; i < n; ++i) {
+      const double dx = point[2 * i] - at[0], dy = point[2 * i + 1] - at[1];
+      if (!(dx * dx + dy * dy < radius * radius)) continue;
+      found.point.insert(found.point.end(), &point[2 * i], &point[2 * i] + 2);
+      found.covariance.insert(found.covariance.end(), &covariance[4 * i], &covariance[4 * i] + 4);
+      found.label.push_back(label[i]);
+    }
+    found.n = static_cast<Index>(found.label.size());
+    return found;
+  }
+
+  double extent() const {
+    double most = 0.0;
+    for (Index i = 0; i < n; ++i) most = std::max(most, std::hypot(point[2 * i], point[2 * i + 1]));
+    return most;
+  }
+
+  std::vector<double> point, covariance;
+  std::vector<Index> label;
+  Index n = 0;
 };
 
-struct LayLimits {  // mapping.constellation:LIMITS
+struct LayLimits {  // places.constellation:LIMITS
   explicit LayLimits(const py::tuple& limits)
       : sigma(limits[0].cast<double>()),
         gate(limits[1].cast<double>()),
@@ -46,11 +70,13 @@ struct LaidPose {
 
 struct LayStart {
   double score, pose[3];
+  Index hypothesis;
 };
 
-// The mean and the poses that may cost least: each pair of cones votes for a cell and the eight around it.
+// The poses about a mean that may cost least: each pair of cones votes for a cell and the eight around it.
 std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known, const double* mean,
-                                 const double* prior, const double* reach, const LayLimits& limits) {
+                                 const double* prior, const double* reach, const LayLimits& limits,
+                                 Index hypothesis) {
   const Index half = static_cast<Index>(std::ceil(reach[0] / limits.cell)) + 1, width = 2 * half + 1;
   const Index turns = static_cast<Index>(std::ceil(reach[1] / limits.turn));
   std::vector<Index> votes(width * width);
@@ -60,13 +86,13 @@ std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known
     const double heading = mean[2] + turn * limits.turn, c = std::cos(heading), s = std::sin(heading);
     std::fill(votes.begin(), votes.end(), 0);
     for (Index i = 0; i < seen.n; ++i) {
-      const double x = seen.point.data()[2 * i], y = seen.point.data()[2 * i + 1];
+      const double x = seen.point[2 * i], y = seen.point[2 * i + 1];
       const double to[2] = {c * x - s * y, s * x + c * y};
       for (Index j = 0; j < known.n; ++j) {
-        if (seen.label.data()[i] != known.label.data()[j]) continue;
+        if (seen.label[i] != known.label[j]) continue;
         Index at[2];
         for (int k = 0; k < 2; ++k) {
-          const double move = known.point.data()[2 * j + k] - to[k] - mean[k];
+          const double move = known.point[2 * j + k] - to[k] - mean[k];
           at[k] = static_cast<Index>(std::floor(clipped(move / limits.cell + 0.5, -1e9, 1e9))) + half;
         }
         if (at[0] <= 0 || at[0] >= 2 * half || at[1] <= 0 || at[1] >= 2 * half) continue;
@@ -80,17 +106,16 @@ std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known
       const double off[3] = {(k / width - half) * limits.cell, (k % width - half) * limits.cell,
                              turn * limits.turn};
       const double score = limits.gain * votes[k] - std::min(square3(off, prior), limits.failed);
-      best.push_back({score, {mean[0] + off[0], mean[1] + off[1], mean[2] + off[2]}});
+      best.push_back({score, {mean[0] + off[0], mean[1] + off[1], mean[2] + off[2]}, hypothesis});
     }
     std::stable_sort(best.begin(), best.end(), more);
     starts.insert(starts.end(), best.begin(),
                   best.begin() + std::min<std::size_t>(best.size(), limits.places));
   }
-  std::stable_sort(starts.begin(), starts.end(), more);
-  starts.insert(starts.begin(), {0.0, {mean[0], mean[1], mean[2]}});
   return starts;
 }
 
+constexpr double kLayRoom = 10.0;  // beyond its reach, about a hypothesis (m)
 constexpr double kLayGates[] = {4.0, 4.0, 2.0, 1.0, 1.0, 1.0};
 constexpr double kLayRegular[] = {1e-2, 1e-2, 1.0};
 
@@ -115,7 +140,7 @@ LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const Arra
     const Turn turn(out.pose[2]);
     double A[3][3] = {}, g[3] = {};
     for (Index i = 0; i < seen.n; ++i) {
-      const double *p = seen.point.data() + 2 * i, *K = seen.covariance.data() + 4 * i;
+      const double *p = &seen.point[2 * i], *K = &seen.covariance[4 * i];
       const double arm[2] = {turn.c * p[0] - turn.s * p[1], turn.s * p[0] + turn.c * p[1]};
       const double cc = turn.c * turn.c, ss = turn.s * turn.s, cs = turn.c * turn.s;
       const double both = 0.5 * (K[1] + K[2]);
@@ -123,11 +148,11 @@ LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const Arra
       const double xy = cs * (K[0] - K[3]) + (cc - ss) * both;
       double least = kInfinity, weight[4] = {}, off[2] = {};
       for (Index j = 0; j < known.n; ++j) {
-        if (seen.label.data()[i] != known.label.data()[j]) continue;
-        const double* q = known.covariance.data() + 4 * j;
+        if (seen.label[i] != known.label[j]) continue;
+        const double* q = &known.covariance[4 * j];
         const double total[4] = {xx + q[0] + floor, xy + q[1], xy + q[2], yy + q[3] + floor};
-        const double dx = arm[0] + out.pose[0] - known.point.data()[2 * j];
-        const double dy = arm[1] + out.pose[1] - known.point.data()[2 * j + 1];
+        const double dx = arm[0] + out.pose[0] - known.point[2 * j];
+        const double dy = arm[1] + out.pose[1] - known.point[2 * j + 1];
         // the square is at least this, since no eigenvalue exceeds the trace
         if (!(dx * dx + dy * dy < std::min(least, limit) * (total[0] + total[3]))) continue;
         double inverse[4];
@@ -168,22 +193,36 @@ LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const Arra
 }
 
 py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, const Array& views,
-               const Array& mean, const Array& prior, const py::tuple& reach, const py::tuple& tuple) {
-  const ConePoints seen(seen_columns), known(known_columns);
+               const Array& means, const Array& prior, const py::tuple& reach, const py::tuple& tuple) {
+  const ConePoints seen(seen_columns), all(known_columns);
   const LayLimits limits(tuple);
-  expect(mean.size() == 3 && prior.size() == 9 && views.size() == 5 * views.shape(0));
+  expect(means.ndim() == 2 && means.shape(1) == 3 && prior.size() == 9 && views.size() == 5 * views.shape(0));
   const double within[2] = {reach[0].cast<double>(), reach[1].cast<double>()};
-  std::vector<LayStart> tried;
+  const double radius = seen.extent() + within[0] + kLayRoom;
+  std::vector<ConePoints> known;
+  std::vector<LayStart> starts, by_votes, tried;
+  for (Index k = 0; k < means.shape(0); ++k) {
+    const double* mean = means.data() + 3 * k;
+    known.push_back(all.near(mean, radius));
+    starts.push_back({0.0, {mean[0], mean[1], mean[2]}, k});
+    const auto found = lay_starts(seen, known.back(), mean, prior.data(), within, limits, k);
+    by_votes.insert(by_votes.end(), found.begin(), found.end());
+  }
+  std::stable_sort(by_votes.begin(), by_votes.end(),
+                   [](const LayStart& a, const LayStart& b) { return a.score > b.score; });
+  starts.insert(starts.end(), by_votes.begin(), by_votes.end());
+  const Index most = means.shape(0) - 1 + 3 * limits.places;
   std::vector<LaidPose> found;
-  for (const LayStart& start : lay_starts(seen, known, mean.data(), prior.data(), within, limits)) {
+  for (const LayStart& start : starts) {
+    if (static_cast<Index>(tried.size()) == most) break;
     const bool is_near = std::any_of(tried.begin(), tried.end(), [&](const LayStart& other) {
       return std::hypot(start.pose[0] - other.pose[0], start.pose[1] - other.pose[1]) < limits.apart &&
              std::abs(start.pose[2] - other.pose[2]) < 1.5 * limits.turn;
     });
     if (is_near) continue;
     tried.push_back(start);
-    found.push_back(lay_refined(seen, known, views, start.pose, mean.data(), prior.data(), limits));
-    if (static_cast<Index>(tried.size()) == 3 * limits.places) break;
+    found.push_back(lay_refined(seen, known[start.hypothesis], views, start.pose,
+                                means.data() + 3 * start.hypothesis, prior.data(), limits));
   }
   const Index m = static_cast<Index>(found.size());
   Array poses({m, Index{3}}), information({m, Index{3}, Index{3}}), squares(m), counts(m), away(m);

@@ -7,20 +7,20 @@ from scipy.linalg import block_diag
 
 from pathspace_graph.baselines.ckf_belief import HEAD, Belief, point_columns
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import left_of, to_map
+from pathspace_graph.factors.se2 import compose, inverse, left_of, move_points, to_map
 from pathspace_graph.front_end.front_end import Reading
-from pathspace_graph.graph.variables import POINT, POSE, pose_keys
+from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping import registration
-from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.registration import Motion, near_start
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
+from pathspace_graph.places.constellation import Constellation, Prior, SampledCurves
+from pathspace_graph.places.find import SURE, find
+from pathspace_graph.places.passes import LAP_TURNED, tried_along
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import refit
 
@@ -29,11 +29,12 @@ from .ckf_update import OnCurve, classify, update
 from .landmark_association import ROUGH_GATE, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 from .online import FRONT_END, OnlineBaseline
-from .periodic import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
+from .periodic import BEGINNING, BEGINNING_SHARE, JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 
 FILTER_REACH: Final = (
     9.0  # largest distance ahead of the vehicle of a curve's end (m along the predicted path)
 )
+RECENT: Final = 2.0  # largest age of the detections that are laid on the early segment (s)
 SIGMA_TIE: Final = 0.15  # standard deviation of the distance between the ends of a curve at closure (m)
 TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
@@ -99,12 +100,13 @@ class CkfMapper(_Filter):
         if self.closed:
             return
         recent = [*self._recent, (state.pose.copy(), detections)]
-        self._recent = [cycle for cycle in recent if cycle[1].t > detections.t - registration.REGISTERED_AGE]
+        self._recent = [cycle for cycle in recent if cycle[1].t > detections.t - RECENT]
         too_soon = self.path.length - self._last_check < settings.check_interval
-        if too_soon or not state.curves or not near_start(self.path, state.pose, settings):
+        if too_soon or not state.curves or not self.path.near_beginning(state.pose, settings):
             return
         self._last_check = self.path.length
-        motion = associate_early_segment(state, self._recent, self.path.beginning)
+        reach = settings.radius_after(self.path.length)
+        motion = associate_early_segment(state, self._recent, self.path.beginning, reach)
         if motion is not None and update_by_correspondences(state, motion):
             simplify(state, self.expansion.observed)
             self.closed = True
@@ -118,33 +120,27 @@ class CkfMapper(_Filter):
         return Map(self.closed, curves, joint)
 
 
-class EarlySegmentSettings(ClosingSettings, group="closing"):
-    """Registration of a filter: less certain than online, with wider limits after some patience."""
-
-    sigma_reading: ClassVar[float] = 0.6
-    patience: ClassVar[float] = 30.0
-    sigma_patience: ClassVar[float] = 1000.0
-
-
 def associate_early_segment(
-    state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array
-) -> Motion | None:
-    """Find the motion of the newest detections onto the beginning of the curves; None without a sure one."""
-    closing = EarlySegmentSettings(**vars(state.settings.closing))
-    track = CurveMap(state.settings)
-    for label in state.curves:
-        track.state.add_boundary(label, state.boundary(label), state.control_points(label))
-    for cycle, (pose, detections) in enumerate(cycles):
-        track.variables.insert(pose_keys(np.array([cycle])), pose)
-        track.detections.append(detections, cycle)
-    track.detections.used[:] = True  # a filter does not record which detections its curves explained
-    times = [detections.t for _, detections in cycles]
-    covariance = state.belief.covariance[:POSE, :POSE]
-    found = registration.register(track, times, covariance, beginning, closing)
-    return None if found is None else found.motion
+    state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array, reach: float
+) -> Array | None:
+    """Find the motion (3,) of the newest detections onto the beginning of the curves; None if none is sure.
+
+    The beginning is tried within a reach (m), from its poses (k, 3) too.
+    """
+    splines = {label: state.spline(label) for label in state.curves}
+    ends = {label: spline.domain[1] for label, spline in splines.items()}
+    early = {label: min(BEGINNING, BEGINNING_SHARE * end) for label, end in ends.items()}
+    poses, table = np.array([pose for pose, _ in cycles]), DetectionColumns.of([seen for _, seen in cycles])
+    seen = Constellation.of(table, poses, state.settings.growth).seen_from(poses[-1])
+    information = np.asarray(np.linalg.inv(state.belief.covariance[:POSE, :POSE]), np.float64)
+    prior = tried_along(beginning, Prior(poses[-1:], information, (reach, LAP_TURNED)))
+    places = find(seen, SampledCurves.of(splines, early), prior)
+    if not places or places[0].odds < SURE:
+        return None
+    return compose(places[0].pose, inverse(poses[-1]))
 
 
-def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
+def update_by_correspondences(state: CurveState, motion: Array) -> bool:
     """Update by the correspondences of the end of each curve and its beginning, in one Kalman update.
 
     `n . (S(u) - S(w)) = 0` with sigma `SIGMA_TIE`, where the motion moves S(u) onto S(w), with the normal n.
@@ -171,14 +167,14 @@ def update_by_correspondences(state: CurveState, motion: Motion) -> bool:
     return True
 
 
-def _overlap(state: CurveState, label: int, motion: Motion) -> tuple[Array, Array]:
+def _overlap(state: CurveState, label: int, motion: Array) -> tuple[Array, Array]:
     """Return parameters (k,) near the end of a curve, and of their correspondences at the beginning (k,)."""
     spline = state.spline(label)
     high = spline.domain[1]
-    u = np.arange(max(high - registration.BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
-    moved = motion.apply(spline.evaluate(u))
+    u = np.arange(max(high - BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
+    moved = move_points(motion, spline.evaluate(u))
     zero = np.zeros(len(u))
-    beginning = min(registration.BEGINNING, registration.BEGINNING_SHARE * high)
+    beginning = min(BEGINNING, BEGINNING_SHARE * high)
     foot = state.foot_points(label, moved, zero, zero + beginning)
     on = foot.interior & (np.abs(foot.distance) < TIE_REACH)
     return u[on], foot.u[on]

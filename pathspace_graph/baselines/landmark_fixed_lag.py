@@ -20,7 +20,6 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping import motion as motions
 from pathspace_graph.mapping.motion import predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.registration import near_start
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.run import CycleResult, Readings, Stopwatch
 
@@ -30,6 +29,7 @@ from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmooth
 from .online import FRONT_END, OnlineBaseline
 
 UNSEEN_PATH: Final = 40.0  # path without a detection after which a landmark is old (m)
+PRIOR_SCALE: Final = 1.5  # factor of the sigmas of the vehicle and the landmarks, which are too certain
 MIN_PAIRS: Final = 4  # least number of pairs that close the loop, a third of them of each colour
 MIN_LEAD: Final = 2.0  # least lead of the score over any other set of pairs, in gates
 
@@ -110,7 +110,7 @@ class LandmarkFixedLag(OnlineBaseline):
         state.vote(detections.label[rows[chosen]], numbers)
 
     def _near_start(self) -> bool:
-        return near_start(self.path, self.smoother.variables.poses[-1], self.settings.closing)
+        return self.path.near_beginning(self.smoother.variables.poses[-1], self.settings.closing)
 
     def _old(self) -> BoolArray:
         last_detected = self._last_detected[self.smoother.map.state.numbers]
@@ -224,12 +224,12 @@ def detect_loop(
     They are the best hypothesis; None if it is ambiguous or too small. The score of a hypothesis is one gate
     for each pair, less its squared distance.
     """
-    state, settings = smoother.map.state, smoother.map.settings
+    state = smoother.map.state
     old = old[nearest_within(state.landmarks[old], state.landmarks[recent], reach)[1]]
     if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
         return None
     gate = MATCH_GATE
-    test = JointCompatibility(smoother, recent, old, settings.closing.prior_scale)
+    test = JointCompatibility(smoother, recent, old, PRIOR_SCALE)
     seeds = np.argwhere(test.distances(test.mean, test.covariance) < gate)
     if len(seeds) == 0:
         return None

@@ -21,9 +21,10 @@ from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, are_poses, pose_keys
-from pathspace_graph.mapping.constellation import NEARBY, find_return, revisit_of, seen_in
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
+from pathspace_graph.places.constellation import Prior
+from pathspace_graph.places.passes import NEARBY, find_return, revisit_of, seen_in
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .association import locate_poses
@@ -162,7 +163,7 @@ def revisits_between(system: JointSystem, state: State) -> list[Revisit]:
                 continue
             due = driven[newest] - before + REVISIT_INTERVAL
             poses = state.poses[: newest + 1]
-            laid = find_return(seen_in(table), poses, before, NEARBY, settings.growth)
-            if laid is not None and laid[0].is_sure:
-                found.append(revisit_of(laid[0], poses, laid[1], newest))
+            again = find_return(seen_in(table), poses, before, Prior.about(poses[-1], *NEARBY), settings)
+            if again is not None:
+                found.append(revisit_of(again[0], poses, again[1], newest))
     return found

@@ -13,9 +13,7 @@ from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.map import NO_CONES, Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.constellation import Constellation
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.settings.mapper import MapperSettings, SplineSettings, known_settings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
@@ -85,32 +83,11 @@ class KnownMap:
             boundary.add_cones(spline.evaluate(end), end)
         return boundary
 
-    def smoother(self, settings: MapperSettings) -> CurveSmoother:
-        """Return a smoother with the map alone, without a drive, for a search."""
-        smoother = CurveSmoother(settings)
-        for label, spline in self.splines.items():
-            points = spline.distinct_control_points
-            smoother.map.state.add_boundary(label, self.boundary(label, settings), points)
-        self.place_cones(smoother.map)
-        return smoother
-
     def place_cones(self, track: CurveMap) -> None:
         """Hand the cones to a map with the known curves; open curves keep weak priors, since they grow."""
         places = {label: cones[:, 0] for label, cones in self.cones.items() if len(cones)}
         stations = {label: cones.T for label, cones in self.cones.items()}
         track.replaced_by({}, places, stations if len(places) == len(stations) else {}, self.closed)
-
-    @property
-    def constellation(self) -> Constellation | None:
-        """Cones in the map frame; None if a curve has none."""
-        points, labels, sigmas = [], [], []
-        for label, cones in self.cones.items():
-            points.append(self.splines[label].evaluate(cones[:, 0]))
-            labels.append(np.full(len(cones), label))
-            sigmas.append(cones[:, 1])
-        covariances = np.concatenate(sigmas)[:, None, None] ** 2 * np.eye(POINT)
-        known = Constellation(np.concatenate(points), covariances, np.concatenate(labels))
-        return known if all(map(len, points)) else None
 
 
 def map_of_cones(

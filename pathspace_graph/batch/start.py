@@ -22,7 +22,11 @@ from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, po
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.constellation import (
+from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
+from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
+from pathspace_graph.mapping.state import State
+from pathspace_graph.places.constellation import Prior
+from pathspace_graph.places.passes import (
     NEARBY,
     SeenIn,
     find_return,
@@ -30,9 +34,6 @@ from pathspace_graph.mapping.constellation import (
     revisit_of,
     seen_in,
 )
-from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
-from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
-from pathspace_graph.mapping.state import State
 from pathspace_graph.run import OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
@@ -210,16 +211,14 @@ def _is_off(revisit: Revisit, poses: Array) -> bool:
     """Whether poses (P, 3) contradict a revisit too much for the search of the next one."""
     off = relative(poses[revisit.earlier], poses[revisit.later]) - revisit.local
     off[2] = wrap_angle(off[2])
-    return float(off @ NEARBY.information @ off) > OFF**2
+    return float(np.square(off / NEARBY[0]).sum()) > OFF**2
 
 
 def _return_again(seen: SeenIn, poses: Array, lap: float, settings: MapperSettings) -> Revisit | None:
     """Return the newest of poses (P, 3) in the frame of one a lap (m) before, after laps were aligned."""
     last = float(path_lengths(poses)[-1]) - LAP_SHARE * lap
-    found = find_return(seen, poses, last, NEARBY, settings.growth)
-    if found is None or not found[0].is_sure:
-        return None
-    return revisit_of(found[0], poses, found[1], len(poses) - 1)
+    found = find_return(seen, poses, last, Prior.about(poses[-1], *NEARBY), settings)
+    return None if found is None else revisit_of(found[0], poses, found[1], len(poses) - 1)
 
 
 def _begin_boundary(

@@ -9,10 +9,9 @@ from pathspace_graph.batch.association import POSE_STEP, headings, locate_poses
 from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose, left_of, relative, rotation
+from pathspace_graph.factors.se2 import compose, left_of, relative
 from pathspace_graph.graph.changes import hold_motion, restart, set_prior
 from pathspace_graph.graph.variables import control_keys, pose_keys
-from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
@@ -69,17 +68,17 @@ def _move_poses(poses: Array, solved: Array) -> None:
 # --- a known map ----------------------------------------------------------------------------------------
 
 
-def lay_on_known(road: Road, known: KnownMap, motion: Motion, covariance: Array) -> Array:
+def lay_on_known(road: Road, known: KnownMap, motion: Array, covariance: Array) -> Array:
     """Replace curves and prior of an open road by a known map; return the jump (3,) of the newest pose.
 
-    The motion registers the road to the map; the covariance (3, 3) is of the newest pose, map frame.
+    The motion (3,) moves the road onto the map; the covariance (3, 3) is of the newest pose, map frame.
     """
     smoother, state = road.smoother, road.smoother.map.state
     variables = state.variables
     sigmas = np.array(SIGMAS_CALIBRATIONS)[: len(variables.calibrations)]
     smoother.reactivate(with_prior=False)
     before, removed = state.poses[-1].copy(), state.map_keys
-    road.move(as_pose(motion))
+    road.move(motion)
     road.growth.wait_for({} if known.closed else known.ends)
     curves = {label: _next(state.boundaries, known, label, road.settings) for label in known.splines}
     state.replace_curves(curves)
@@ -87,7 +86,7 @@ def lay_on_known(road: Road, known: KnownMap, motion: Motion, covariance: Array)
     points = np.concatenate([spline.distinct_control_points for spline in known.splines.values()])
     restart(smoother, smoother.first_cycle, removed, added, points)
     known.place_cones(smoother.map)
-    motion.move(state.poses)
+    state.poses[:] = compose(motion, state.poses)
     locate_poses(state)
     if not known.closed:
         _locate_first(state)
@@ -121,12 +120,6 @@ def _next(boundaries: dict[int, Boundary], known: KnownMap, label: int, settings
     """Return a known curve whose control points have new keys."""
     before = boundaries.get(label)
     return known.boundary(label, settings, before.first + before.size if before else 0)
-
-
-def as_pose(motion: Motion) -> Array:
-    """Return a motion as the pose (3,) of the moved origin."""
-    turn = motion.vector[2]
-    return np.append(motion.centre + motion.vector[:2] - rotation(turn) @ motion.centre, turn)
 
 
 # --- the gauge -------------------------------------------------------------------------------------------

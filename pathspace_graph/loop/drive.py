@@ -11,11 +11,11 @@ from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import ClosedMap, LapMarginal
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import compose, inverse
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.health import Health, HealthMonitor
 from pathspace_graph.mapping.motion import inflate_priors
-from pathspace_graph.mapping.registration import Motion
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -100,10 +100,10 @@ class Drive(Copyable):
         road.place_orange(self.record.corrected)
         return jump
 
-    def lay_on_known(self, road: Road, known: KnownMap, motion: Motion, covariance: Array) -> Array:
-        """Replace an open road by the known map that it is registered to; return the jump (3,)."""
-        earlier = self.record.with_window(road)[: road.smoother.first_cycle]
-        motion.move(earlier)
+    def lay_on_known(self, road: Road, known: KnownMap, pose: Array, covariance: Array) -> Array:
+        """Replace an open road by the known map on which the newest pose (3,) lies; return the jump (3,)."""
+        motion = compose(pose, inverse(road.poses[-1]))
+        earlier = compose(motion, self.record.with_window(road)[: road.smoother.first_cycle])
         self.solver.give_up(road.next_cycle)
         jump = lay_on_known(road, known, motion, covariance)
         self.record.replaced(np.concatenate([earlier, road.poses]))

@@ -19,10 +19,10 @@ from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.io.log import Detections
-from pathspace_graph.mapping.constellation import SeenIn
 from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.road import Road
+from pathspace_graph.places.passes import SeenIn
 from pathspace_graph.settings.mapper import MapperSettings
 
 T = TypeVar("T")
@@ -138,7 +138,7 @@ class DriveRecord(Copyable):
         self.replaced(np.concatenate([bent[:first], window]))
 
     def seen_in(self, sensor: Array, noise: NoiseLearner) -> SeenIn:
-        """Return a lookup of the cones detected in given cycles.
+        """Return a lookup of the detections of given cycles, of orange cones too.
 
         Points are corrected by the calibration of the sensor, (5,) or (0,).
         """
@@ -149,7 +149,7 @@ class DriveRecord(Copyable):
             table = DetectionColumns.of([one.seen.with_others(one.orange) for one in chosen], twists=twists)
             table = replace(_for_map(table, noise), cycle=cycles[table.cycle])
             table.correct(sensor)
-            return table.cones(self.settings.of_lines)
+            return table
 
         return seen_in
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import hypot, sqrt
 from typing import Final
 
 import numpy as np
@@ -16,11 +17,9 @@ from pathspace_graph.graph.variables import POSE
 from pathspace_graph.health import SHARE_DEGRADED, Evidence
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.registration import worst_sigma
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
 from pathspace_graph.mapping.state import SAMPLE
 
-MIDDLE_STEP: Final = 2.0  # step of the points of the middle (m)
 BESIDE_CURVE: Final = 1.0  # distance from the closed curve within which an unused detection is explained (m)
 GAP_RATIO: Final = 3.0  # least distance of neighbouring cones beside a gap, over the median distance
 _POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])  # unit vectors of a pose's position
@@ -28,20 +27,11 @@ _POSITION: Final = np.asfortranarray(np.eye(POSE)[:, :2])  # unit vectors of a p
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A closed map, sampled for search and comparison."""
+    """A closed map, sampled for comparison with detections."""
 
-    middle: Array  # (n, 2) points on the middle of the track in driving order, in m, map frame
-    stations: Array  # (n,) stations of these points (m)
-    length: float  # length of the middle (m)
-    beside: Mapping[int, Array]  # (n,) parameters on each boundary beside the points of the middle (m)
     curves: Mapping[int, KDTree]  # densely sampled points of each boundary
     mapped: Mapping[int, BoolArray]  # whether each of these points is between mapped cones (`is_mapped`)
     begins: Mapping[int, float]  # parameter of the first point (m)
-
-    def at(self, stations: Array) -> Array:
-        """Interpolate the middle at stations of any shape, as complex numbers x + i y."""
-        x, y = (np.interp(stations, self.stations, axis, period=self.length) for axis in self.middle.T)
-        return np.asarray(x + 1j * y)
 
     def distances(self, labels: IntArray, points: Array, most: float) -> Array:
         """Return distances (..., m) in m of points (..., m, 2) from their labels' curves, up to `most`."""
@@ -98,23 +88,15 @@ def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) 
 
 
 def lay_out_loop(track: CurveMap) -> Loop:
-    """Sample the loop between two closed curves."""
-    u, points, mapped, begins, margin = {}, {}, {}, {}, track.settings.growth.merge_radius
+    """Sample both closed curves."""
+    curves, mapped, begins, margin = {}, {}, {}, track.settings.growth.merge_radius
     for label, boundary in track.state.boundaries.items():
-        u[label] = np.arange(boundary.tables.low, boundary.tables.high, SAMPLE)
-        points[label] = boundary.evaluate(track.state.control_points(label), u[label])
+        u = np.arange(boundary.tables.low, boundary.tables.high, SAMPLE)
+        curves[label] = KDTree(boundary.evaluate(track.state.control_points(label), u))
         begins[label] = boundary.tables.low
         cones = track.cones.get(label, np.zeros(0))
-        mapped[label] = is_mapped(u[label], cones, boundary.length, GAP_RATIO, margin)
-    curves = {label: KDTree(curve) for label, curve in points.items()}
-    every = max(int(MIDDLE_STEP / SAMPLE), 1)
-    left = points[LEFT][::every]
-    opposite = curves[RIGHT].query(left)[1]
-    middle = 0.5 * (left + points[RIGHT][opposite])
-    steps = np.hypot(*np.diff(middle, axis=0, append=middle[:1]).T)
-    stations = np.concatenate([[0.0], steps.cumsum()[:-1]])
-    beside = {LEFT: u[LEFT][::every], RIGHT: u[RIGHT][opposite]}
-    return Loop(middle, stations, float(steps.sum()), beside, curves, mapped, begins)
+        mapped[label] = is_mapped(u, cones, boundary.length, GAP_RATIO, margin)
+    return Loop(curves, mapped, begins)
 
 
 class KnownLoop(Copyable):
@@ -181,7 +163,8 @@ def _sigma_of_position(smoother: CurveSmoother) -> float:
     if last is None:
         return np.nan
     half = half_solve(last.factor[-POSE:, -POSE:], _POSITION.copy())  # the newest pose is last
-    return worst_sigma(half.T @ half)
+    (a, b), (_, d) = (half.T @ half).tolist()
+    return sqrt(0.5 * (a + d) + hypot(0.5 * (a - d), b))
 
 
 def _by_boundary(labels: IntArray) -> tuple[int, int]:

@@ -145,7 +145,8 @@ class MapRepair(Copyable):
         loop, self._asked = known.of(smoother), t
         self._stretches = self.contradictions.stretches(loop, t)
         if self._stretches:
-            self._attempts, self._wait_until = self._attempts + 1, driven + loop.length
+            longest = max(boundary.length for boundary in smoother.map.state.boundaries.values())
+            self._attempts, self._wait_until = self._attempts + 1, driven + longest
         return bool(self._stretches)
 
     def begin(self, smoother: CurveSmoother, poses: Array) -> ClosedMap:

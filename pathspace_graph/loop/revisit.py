@@ -2,7 +2,7 @@
 
 A lap closes where it began, but the second round of a skidpad does not, nor does a lane that leads into a
 circuit. There the cones of the last metres are registered to those of the earlier pass
-(`mapping.constellation`), which gives a factor between two poses (`graph.relative:Revisit`). The open map is
+(`places.passes`), which gives a factor between two poses (`graph.relative:Revisit`). The open map is
 optimized with it as with a closed loop, and continues to grow.
 """
 
@@ -13,21 +13,15 @@ import numpy as np
 from pathspace_graph.batch.start import REVISIT_INTERVAL
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import (
-    compose,
-    inverse,
-    path_lengths,
-    to_vehicle,
-)
+from pathspace_graph.factors.se2 import compose, inverse, path_lengths, to_vehicle
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.changes import solve_revisit
 from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.mapping.constellation import NEARBY, SeenIn, lay_newest, revisit_of
-from pathspace_graph.mapping.registration import (
-    HEADING,
-)
+from pathspace_graph.mapping.path import HEADING
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
+from pathspace_graph.places.constellation import Prior
+from pathspace_graph.places.passes import NEARBY, SeenIn, newest_place, revisit_of
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .closing import SIGMA_STEP
@@ -51,7 +45,7 @@ class Revisits(Copyable):
     def find(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
         """Return a revisit by the oldest pose of the window, if an attempt is due and finds one."""
         smoother, length = road.smoother, road.path.length
-        if length < self._next or record.unsolvable is not None:
+        if length < self._next or record.unsolvable is not None or self.settings.of_lines:
             return None
         if smoother.submaps is None or not smoother.submaps.keyframes:
             return None
@@ -66,12 +60,12 @@ class Revisits(Copyable):
 
     def _measured(self, smoother: CurveSmoother, seen_in: SeenIn, poses: Array, place: int) -> Revisit | None:
         """Return the oldest pose of the window relative to the keyframe nearest to an earlier place."""
-        laid = lay_newest(seen_in, poses, place, NEARBY, self.settings.growth)
-        if laid is None or not laid.is_sure:
+        found = newest_place(seen_in, poses, place, Prior.about(poses[-1], *NEARBY), self.settings)
+        if found is None:
             return None
         keyframes = np.array(smoother.keyframe_cycles)
         earlier = int(keyframes[np.abs(keyframes - place).argmin()])
-        return revisit_of(laid, poses, earlier, smoother.first_cycle)
+        return revisit_of(found, poses, earlier, smoother.first_cycle)
 
 
 def lay_on(road: Road, record: DriveRecord, revisit: Revisit) -> Array:

@@ -10,6 +10,7 @@ from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.settings.online import ClosingSettings
 
 STEP: Final = 0.3  # least distance of neighbouring positions of the stored path (m)
 PATH_MEMORY: Final = 60.0  # length of the stored path behind the vehicle, and of the stored first stretch (m)
@@ -17,6 +18,7 @@ BEGINNING_STEP: Final = 1.0  # least distance of neighbouring poses of the store
 MAX_CURVATURE: Final = 0.3  # largest curvature of the predicted path (1/m), of a tight hairpin
 CURVATURE_GAIN: Final = 0.4  # weight of a cycle's measured curvature in the smoothed one
 MIN_SPEED: Final = 1.0  # least speed (m/s) for a curvature from yaw rate over speed
+HEADING: Final = 0.8  # largest angle between the headings of two passes of one place (rad)
 SIDES: Final = {LEFT: 1.0, RIGHT: -1.0}  # sign of the distance from the path of each boundary
 
 
@@ -77,6 +79,14 @@ class DrivenPath:
             self.stations = np.append(self.stations, self.length)
             keep = self.stations >= self.length - PATH_MEMORY
             self.points, self.stations = self.points[keep], self.stations[keep]
+
+    def near_beginning(self, pose: Array, settings: ClosingSettings) -> bool:
+        """Whether a pose (3,) may be on the beginning again: after a lap, near it, and in its direction."""
+        if self.length < settings.min_path:
+            return False
+        away = np.hypot(*(self.beginning[:, :2] - pose[:2]).T)
+        same_direction = np.cos(self.beginning[:, 2] - pose[2]) > np.cos(HEADING)
+        return bool((same_direction & (away < settings.radius_after(self.length))).any())
 
     def move(self, motion: Array) -> None:
         """Move the path behind the vehicle by a rigid motion (3,) of the map frame, except its beginning."""

@@ -45,14 +45,6 @@ class ClosingSettings(Checked):
     check_interval: ClassVar[float] = 2.0  # m along the path, from one attempt to close the loop to the next
     radius: ClassVar[float] = 8.0  # m from the first stretch of the drive, within which the loop may close
     drift: ClassVar[float] = 0.03  # growth of `radius` with the path driven (m/m)
-    overlap: ClassVar[float] = 8.0  # length of the beginning that must have been driven again (m)
-    inlier_distance: ClassVar[float] = 0.4  # m from the beginning's curve, within which a detection is inlier
-    inlier_share: ClassVar[float] = 0.8  # least share of inliers among the matched detections
-    prior_scale: ClassVar[float] = 1.5  # factor of the vehicle's standard deviations in the prior
-    sigma_reading: ClassVar[float] = 0.5  # m, of a detection in the registration: many are of one cone
-    patience: ClassVar[float] = 40.0  # m of the beginning driven again, from which a straight may close:
-    sigma_patience: ClassVar[float] = 0.85
-    """Replaces `sigma_max` then (m), since detections on a straight leave it free; not for a lost vehicle."""
     iterations: ClassVar[int] = 2  # Gauss-Newton steps after the loop is found, and after simplification
 
     def radius_after(self, length: float) -> float:

@@ -13,11 +13,9 @@ from pathspace_graph.eval.metrics.accuracy import cone_distances
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
-from pathspace_graph.mapping.registration import RefinedMotion, near_start, register
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import Knots, MapperSettings
-from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import relocate
 
 from ..scenes.drives import (
@@ -136,54 +134,6 @@ def test_readings_in_use_lie_on_the_closed_curve(run: tuple[FixedLagMapper, list
         assert np.abs(foot.distance).max() < 0.1
 
 
-def covariance_of(mapper: FixedLagMapper) -> Array:
-    """(3, 3) of the newest pose."""
-    return mapper.marginal_covariance([mapper.pose_key(mapper.road.smoother.next_cycle - 1)])
-
-
-def registered(mapper: FixedLagMapper, theta: float, shift: Array) -> RefinedMotion:
-    """The window of a mapper drifts by a rigid motion about the vehicle; how it is found back.
-
-    How certain the position along the track is doesn't matter here.
-    """
-    c, s = np.cos(theta), np.sin(theta)
-    centre = mapper.poses[-1, :2].copy()
-    mapper.poses[:, :2] = (mapper.poses[:, :2] - centre) @ np.array([[c, s], [-s, c]]) + centre + shift
-    mapper.poses[:, 2] += theta
-    registration = register(
-        mapper.road.smoother.map,
-        mapper.road.smoother.times,
-        covariance_of(mapper),
-        mapper.road.path.beginning,
-        ClosingSettings(sigma_max=10.0),
-    )
-    assert registration is not None
-    return registration
-
-
-@pytest.mark.parametrize(
-    ("theta", "shift"), [(0.0, (0.0, 0.0)), (0.02, (0.3, -0.25)), (-0.03, (-0.1, 0.4)), (0.0, (0.6, 0.0))]
-)
-def test_a_drifted_window_is_registered_back(
-    before: FixedLagMapper, theta: float, shift: tuple[float, float]
-) -> None:
-    """Across the track by the readings; along it as far as the curve's bends tell."""
-    mapper, poses_before = before, before.poses.copy()
-    registration = registered(mapper, theta, np.array(shift))
-    assert registration.motion.vector[2] == pytest.approx(-theta, abs=0.02)
-    moved = registration.motion.apply(mapper.poses[:, :2])
-    np.testing.assert_allclose(moved, poses_before[:, :2], atol=0.3)
-    detections = mapper.road.smoother.map.detections
-    for label in mapper.boundaries:
-        rows, u = registration.matches.inliers(label)
-        assert (detections.label[rows] == label).all()
-        points = registration.motion.apply(detections.points_map(rows, mapper.road.smoother.variables))
-        on_curve = mapper.boundaries[label].evaluate(mapper.control_points(label), u)
-        distances = np.hypot(*(points - on_curve).T)
-        assert np.median(distances) < 0.1
-        assert distances.max() < mapper.settings.closing.inlier_distance + 0.1
-
-
 def test_knots_by_the_cones_are_nearer_to_them_than_knots_by_curvature(before: FixedLagMapper) -> None:
     """Of the same number of control points, and where a cone asks for one."""
     before.road.smoother.reactivate()
@@ -218,14 +168,14 @@ def test_no_loop_is_shorter_than_the_shortest(log: Log) -> None:
     for odometry, cycle in split_odometry(replace(log, cycles=log.cycles[:175])):
         mapper.update(odometry, cycle)
     assert not mapper.closed
-    assert not near_start(mapper.road.path, mapper.poses[-1], settings.closing)
-    assert near_start(mapper.road.path, mapper.poses[-1], MapperSettings().closing)
+    assert not mapper.road.path.near_beginning(mapper.poses[-1], settings.closing)
+    assert mapper.road.path.near_beginning(mapper.poses[-1], MapperSettings().closing)
 
 
 def test_standing_on_the_start_line_closes_nothing() -> None:
     log = exact_log(ahead(0.0, 4.0), *corridor(60.0))
     mapper, _ = map_log(log)
-    assert not near_start(mapper.road.path, mapper.poses[-1], mapper.settings.closing)
+    assert not mapper.road.path.near_beginning(mapper.poses[-1], mapper.settings.closing)
     assert not mapper.closed
 
 
@@ -256,15 +206,3 @@ def test_a_lost_place_is_found_by_position_and_heading(
         if not turned:
             away = (found - u + 0.5 * boundary.length) % boundary.length - 0.5 * boundary.length
             assert abs(away) < 0.1
-
-
-def test_a_window_that_has_drifted_far_is_registered_back(before: FixedLagMapper) -> None:
-    """Farther than the iteration bridges, but within what the vehicle knows of itself."""
-    mapper, poses_before = before, before.poses.copy()
-    mapper.poses[:, :2] += [6.0, -5.0]
-    unsure = covariance_of(mapper) + np.diag([25.0, 25.0, 1e-3])
-    track, times = mapper.road.smoother.map, mapper.road.smoother.times
-    registration = register(track, times, unsure, mapper.road.path.beginning, ClosingSettings(sigma_max=10.0))
-    assert registration is not None
-    moved = registration.motion.apply(mapper.poses[:, :2])
-    np.testing.assert_allclose(moved, poses_before[:, :2], atol=0.4)

@@ -34,8 +34,7 @@ def lane(gap: tuple[float, float] | None = None) -> Loop:
     mapped = np.ones(len(x), bool) if gap is None else (x < gap[0]) | (x > gap[1])
     curves = {LEFT: KDTree(left), RIGHT: KDTree(right)}
     begins = dict.fromkeys((LEFT, RIGHT), 0.0)
-    beside, gaps = {LEFT: x, RIGHT: x}, {LEFT: mapped, RIGHT: mapped}
-    return Loop(0.5 * (left + right), x, 100.0, beside, curves, gaps, begins)
+    return Loop(curves, {LEFT: mapped, RIGHT: mapped}, begins)
 
 
 def seen(

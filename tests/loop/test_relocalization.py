@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.arrays import BoolArray
 from pathspace_graph.factors.noise import KnownNoise
-from pathspace_graph.factors.se2 import compose, inverse, move_points, to_vehicle
+from pathspace_graph.factors.se2 import compose, to_vehicle
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.graph.changes import forget_poses
 from pathspace_graph.graph.gaussian import factorize, marginalize
@@ -21,11 +21,11 @@ from pathspace_graph.graph.variables import Layout, pose_keys
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.known_loop import KnownLoop, evidence_of, lay_out_loop
-from pathspace_graph.loop.relocalization import FOUND, SEARCH_MEMORY, SIGMAS_PLACE, Search, restart_window
-from pathspace_graph.mapping.registration import Matches, Motion, RefinedMotion
+from pathspace_graph.loop.known_loop import KnownLoop, evidence_of
+from pathspace_graph.loop.lost import FOUND, LEAST_PATH, SEARCH_MEMORY, WIDENING, Search, restart_window
 from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.places.find import KnownRoad, Place
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -165,68 +165,62 @@ def test_a_wrong_colour_says_nothing_about_the_vehicle() -> None:
 # --- the search alone ------------------------------------------------------------------------------------
 
 
-def test_the_middle_of_the_loop_lies_between_the_curves() -> None:
-    _, mapper, _ = clean()
-    state = mapper.road.smoother.map.state
-    loop = lay_out_loop(mapper.road.smoother.map)
-    for label, u in loop.beside.items():
-        points = state.boundaries[label].evaluate(mapper.control_points(label), u)
-        across = np.hypot(*(points - loop.middle).T)
-        assert np.abs(across - 1.8).max() < 0.4
-    at = loop.at(loop.stations)
-    np.testing.assert_allclose(np.column_stack([at.real, at.imag]), loop.middle, atol=1e-9)
-    np.testing.assert_allclose(loop.at(loop.stations + loop.length), at, atol=1e-9)
+@cache
+def known_road(has_cones: bool) -> KnownRoad:
+    """The map of a clean drive, with its cones or without."""
+    track = clean()[1].road.smoother.map
+    cones = {label: np.column_stack([u, np.zeros(len(u))]) for label, u in track.cones.items()}
+    return KnownRoad.of(track.state.splines, cones if has_cones else None)
 
 
-def test_the_motion_that_took_the_vehicle_away_is_undone() -> None:
+def searched(has_cones: bool, away: Array, cycles: slice) -> list[Place | None]:
+    """The results of a search along true poses, all moved by a motion (3,)."""
     log, mapper, _ = clean()
-    away = np.array([25.0, -8.0, 1.2])
-    search, found = Search(mapper.road), None
+    search, found = Search(mapper.road, known_road(has_cones)), list[Place | None]()
     search._tried = -np.inf
-    for pose, cycle in zip(true_poses(log)[150:190], log.cycles[150:190], strict=True):
+    for pose, cycle in zip(true_poses(log)[cycles], log.cycles[cycles], strict=True):
         search.observe(compose(away, pose), cycle)
-        found = search.find(mapper.road.smoother) or found
-    assert found is not None
-    truth = true_poses(log)[[170, 189]]
-    moved = move_points(away, truth[:, :2])
-    np.testing.assert_allclose(found.motion.apply(moved), truth[:, :2], atol=0.5)
-    np.testing.assert_allclose(found.motion.vector[2], inverse(away)[2], atol=0.05)
+        found.append(search.find())
+    return found
 
 
-def test_the_prior_of_a_place_that_was_found_has_three_times_the_sigmas_of_its_registration() -> None:
+@pytest.mark.parametrize("has_cones", [True, False])
+def test_a_vehicle_is_found_wherever_its_odometry_has_it(has_cones: bool) -> None:
+    """By its cones after 60 m, without cones on the curves alone."""
+    log, cycles = clean()[0], slice(140, 215)
+    found = searched(has_cones, np.array([25.0, -8.0, 1.2]), cycles)
+    sure = [k for k, place in enumerate(found) if place is not None]
+    assert sure
+    for k in sure:
+        place = found[k]
+        assert place is not None
+        off = place.pose - true_poses(log)[cycles][k]
+        np.testing.assert_allclose(off[:2], 0.0, atol=0.5)
+        np.testing.assert_allclose(np.sin(off[2]), 0.0, atol=0.05)
+
+
+def test_nothing_is_found_before_the_path_has_a_shape() -> None:
+    log = clean()[0]
+    found = searched(True, np.zeros(3), slice(150, 175))
+    driven = np.hypot(*np.diff(true_poses(log)[150:175, :2], axis=0).T).cumsum()
+    assert all(place is None for place in found[: int(driven.searchsorted(LEAST_PATH))])
+
+
+def test_the_prior_of_a_place_that_was_found_has_three_times_its_sigmas() -> None:
     """Its detections are used once more, in the window: without them, only the prior is left."""
     smoother = copied(clean()[1].road.smoother)
     covariance = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.002], [0.0, 0.002, 0.01]])
-    nothing = Matches(np.zeros(0, np.intp), *[np.zeros(0)] * 4, np.zeros((3, 3)), np.zeros(3))  # type: ignore[arg-type]
-    motion = Motion(smoother.map.state.poses[-1, :2].copy(), np.array([0.1, -0.05, 0.01]))
-    jump = restart_window(smoother, smoother.next_cycle - 5, RefinedMotion(motion, nothing, covariance))
+    pose = smoother.map.state.poses[-1] + [0.1, -0.05, 0.01]
+    jump = restart_window(smoother, smoother.next_cycle - 5, Place(pose, np.linalg.inv(covariance), 9.0))
     assert np.hypot(*jump[:2]) < 0.3
     smoother.map.detections.release(np.arange(len(smoother.map.detections)))
     newest = pose_keys(np.array([smoother.next_cycle - 1]))
-    np.testing.assert_allclose(smoother.covariance(newest), 9.0 * covariance, atol=1e-6)
-
-
-def test_what_was_seen_counts_a_ninth_at_a_place_where_it_is_seen_again() -> None:
-    """Of the information at the place, a part is the prior's and stays."""
-    search = Search(clean()[1].road)
-    prior = np.diag(np.array(SIGMAS_PLACE) ** -2.0)
-    seen = np.array([[25.0, 3.0, 0.0], [3.0, 100.0, -20.0], [0.0, -20.0, 900.0]])
-    nothing = Matches(np.zeros(0, np.intp), *[np.zeros(0)] * 4, np.zeros((3, 3)), np.zeros(3))  # type: ignore[arg-type]
-    found = RefinedMotion(Motion(np.zeros(2), np.zeros(3)), nothing, np.linalg.inv(prior + seen))
-    np.testing.assert_allclose(np.linalg.inv(search.widened(found)), prior + seen / 9.0, atol=1e-9)
-
-
-def test_no_place_is_found_with_too_few_detections() -> None:
-    log, mapper, _ = clean()
-    search = Search(mapper.road)
-    search._tried = -np.inf
-    search.observe(true_poses(log)[150], log.cycles[150])
-    assert search.find(mapper.road.smoother) is None
+    np.testing.assert_allclose(smoother.covariance(newest), WIDENING**2 * covariance, atol=1e-6)
 
 
 def test_the_remembered_path_has_a_bound() -> None:
     log, mapper, _ = clean()
-    search = Search(mapper.road)
+    search = Search(mapper.road, known_road(True))
     for pose, cycle in zip(true_poses(log), log.cycles, strict=True):
         search.observe(pose, cycle)
     poses = np.array(search._poses)

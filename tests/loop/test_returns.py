@@ -5,31 +5,48 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pathspace_graph.loop import returns
 from pathspace_graph.loop.returns import RETURN_CYCLES, ReturnFinder
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.bspline import BSpline
 
 STEP = MapperSettings().closing.check_interval
 
 
 @pytest.fixture
 def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return a list that gets what is tried, on a road that is always near its beginning."""
+    """Return a list that gets what is tried."""
     ways: list[str] = []
-    monkeypatch.setattr(returns, "near_start", lambda *_: True)
     monkeypatch.setattr(returns, "unwrap", lambda poses: poses)
-    monkeypatch.setattr(returns, "return_to_beginning", lambda *_: ways.append("cones"))
-    monkeypatch.setattr(ReturnFinder, "_by_curves", lambda *_: ways.append("curves"))
+    monkeypatch.setattr(
+        returns, "return_to_beginning", lambda *found: ways.append("cones" if found[-1] is None else "curves")
+    )
     return ways
 
 
-def searched(finder: ReturnFinder, cycle: int, length: float) -> None:
-    smoother = SimpleNamespace(variables=SimpleNamespace(sensor=None), newest_covariance=lambda: None)
-    path = SimpleNamespace(length=length)
-    record = SimpleNamespace(seen_in=lambda *_: None, poses=None)
-    road = {"path": path, "next_cycle": cycle, "poses": [None], "boundaries": {0: None}, "smoother": smoother}
+def searched(finder: ReturnFinder, cycle: int, length: float, is_near: bool = True) -> None:
+    """Search on a road near its beginning, or far from it, with a curve whose first 30 m count."""
+    line = BSpline.open_uniform(np.column_stack([np.arange(9.0), np.zeros(9)]))
+    smoother = SimpleNamespace(
+        variables=SimpleNamespace(sensor=None),
+        newest_covariance=lambda: None,
+        transform_to_origin=lambda: None,
+        refresh=lambda: None,
+        map=SimpleNamespace(state=SimpleNamespace(splines={0: line})),
+    )
+    path = SimpleNamespace(length=length, near_beginning=lambda *_: is_near)
+    record = SimpleNamespace(seen_in=lambda *_: None, poses=None, with_window=lambda _: None)
+    boundaries = {0: SimpleNamespace(confirmed_end=50.0)}
+    road = {
+        "path": path,
+        "next_cycle": cycle,
+        "poses": [None],
+        "boundaries": boundaries,
+        "smoother": smoother,
+    }
     finder.find(SimpleNamespace(**road, settings=None), record, None)  # type: ignore[arg-type]
 
 
@@ -61,7 +78,6 @@ def test_nothing_is_tried_in_a_rest(tried: list[str]) -> None:
     assert len(tried) == 1
 
 
-def test_far_from_the_beginning_nothing_is_tried(tried: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(returns, "near_start", lambda *_: False)
-    searched(ReturnFinder(MapperSettings()), 1, 100.0)
+def test_far_from_the_beginning_nothing_is_tried(tried: list[str]) -> None:
+    searched(ReturnFinder(MapperSettings()), 1, 100.0, is_near=False)
     assert tried == []

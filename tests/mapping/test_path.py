@@ -8,8 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pathspace_graph.factors.se2 import compose
 from pathspace_graph.mapping import path as path_module
 from pathspace_graph.mapping.path import DrivenPath, PathAhead, along_and_across
+from pathspace_graph.settings.online import ClosingSettings
 
 Array = NDArray[np.float64]
 
@@ -162,3 +164,26 @@ def test_a_vehicle_that_reverses_after_a_motion_takes_the_path_back() -> None:
     path.update(np.array([11.8, 0.0, 0.0]))
     np.testing.assert_allclose(path.points[:, 0], [10.0, 11.0, 11.8])
     assert path.length == pytest.approx(1.8)
+
+
+@pytest.mark.parametrize(
+    ("pose", "near"),
+    [
+        ((0.0, 0.0, 0.0), True),
+        ((10.0, 9.0, 0.3), True),
+        ((10.0, 12.0, 0.3), False),
+        ((10.0, 0.0, np.pi), False),
+        ((10.0, 0.0, 2.0 * np.pi), True),
+    ],
+)
+def test_near_the_start_is_a_matter_of_place_and_direction(
+    pose: tuple[float, ...], near: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After 80 m straight on, on the first 20 m: within 8 m + 3 % of 80 m, and 0.8 rad."""
+    monkeypatch.setattr(path_module, "PATH_MEMORY", 20.0)
+    path, frame = DrivenPath(), np.array([3.0, -5.0, 0.7])
+    for x in np.arange(0.0, 80.1, 0.5):
+        path.update(compose(frame, np.array([x, 0.0, 0.0])))
+    there = compose(frame, np.array(pose))
+    assert path.near_beginning(there, ClosingSettings()) is near
+    assert not path.near_beginning(there, ClosingSettings(min_path=100.0))

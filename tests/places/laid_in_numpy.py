@@ -8,7 +8,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import left_of, rotation, wrap_angle
-from pathspace_graph.mapping.constellation import Cones
+from pathspace_graph.places.constellation import Cones
 
 GATES: Final = (4.0, 4.0, 2.0, 1.0, 1.0, 1.0)  # factors of the cap in the steps of the refinement
 REGULAR: Final = (1e-2, 1e-2, 1.0)  # information added in a step, so that few cones still give one
@@ -18,22 +18,28 @@ def laid(
     seen: Cones,
     known: Cones,
     views: Array,
-    mean: Array,
+    means: Array,
     prior: Array,
     reach: tuple[float, float],
     limits: tuple[float, ...],
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the places where seen cones may lie, as `lay` compares them."""
-    apart, places = limits[4], int(limits[5])
+    """Return the places where seen cones may lie, as `find` compares them.
+
+    Each mean is tried, as few cones may have been met again, and then the poses that may cost least.
+    """
+    apart, places, means = limits[4], int(limits[5]), np.asarray(means)
+    votes = [(*one, mean) for mean in means for one in _starts(seen, known, mean, prior, reach, limits)]
+    starts = [(mean, mean) for mean in means]
+    starts += [(start, mean) for _, start, mean in sorted(votes, key=lambda one: -one[0])]
     tried, found = list[Array](), []
-    for start in _starts(seen, known, mean, prior, reach, limits):
+    for start, mean in starts:
+        if len(tried) == len(means) - 1 + 3 * places:
+            break
         off = [(np.hypot(*(start - other)[:2]), abs(start[2] - other[2])) for other in tried]
         if any(distance < apart and turn < 1.5 * limits[3] for distance, turn in off):
             continue
         tried.append(start)
         found.append(_refined(seen, known, views, start, mean, prior, limits))
-        if len(tried) == 3 * places:
-            break
     poses, information, squares, counts, away = (np.array(column) for column in zip(*found, strict=True))
     return poses, information, squares, counts, away
 
@@ -45,8 +51,8 @@ def _starts(
     prior: Array,
     reach: tuple[float, float],
     limits: tuple[float, ...],
-) -> list[Array]:
-    """Return poses (3,): the mean, as few cones may have been met again, and those that may cost least.
+) -> list[tuple[float, Array]]:
+    """Return scores and poses (3,) about a mean that may cost least.
 
     Each pair of cones votes for a cell and the eight around it, against the distance from the mean.
     """
@@ -72,7 +78,7 @@ def _starts(
         )
         best = np.argsort(-score, kind="stable")[:places]
         starts += zip(score[best].tolist(), mean + off[best], strict=True)
-    return [mean, *(start for _, start in sorted(starts, key=lambda one: -one[0]))]
+    return starts
 
 
 def _refined(

@@ -1,40 +1,38 @@
-"""Constellations: the pose that lays cones on others, how certain it is, and which returns are believed."""
+"""Constellations, where they lie on others, how sure a place is, and which returns are believed."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from math import log
 
 import numpy as np
 import pytest
 
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.se2 import compose, left_of, path_lengths, relative, rotation, to_map, to_vehicle
+from pathspace_graph.factors.se2 import compose, left_of, path_lengths, relative, to_map, to_vehicle
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.mapping.constellation import (
-    LAID_CONES,
-    LAID_MISFIT,
-    LAID_ODDS,
-    LAID_SIGHTINGS,
-    LAID_SIGMA,
-    NEARBY,
-    ODOMETRY_FAILED,
+from pathspace_graph.mapping.detections import DetectionColumns
+from pathspace_graph.mapping.tentative import TentativeTracks, merged_in_turn
+from pathspace_graph.places.constellation import (
+    FAILED,
+    FIT_SIGMA,
     RANGE,
-    UNSEEN,
+    SIGHTINGS,
     VIEWS,
     Constellation,
-    Laid,
+    Prior,
+)
+from pathspace_graph.places.find import BY_CHANCE, LEAST_CONES, SURE, Place, find
+from pathspace_graph.places.passes import (
+    NEARBY,
     SeenIn,
     find_return,
-    lay,
-    relative_pose,
     return_to_beginning,
     revisit_of,
 )
-from pathspace_graph.mapping.detections import DetectionColumns
-from pathspace_graph.mapping.tentative import TentativeTracks, merged_in_turn
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import path_of
@@ -74,42 +72,49 @@ def beside(known: Constellation, chosen: slice | IntArray, pose: Array = POSE) -
     return part.seen_from(pose)
 
 
+def best(
+    seen: Constellation, known: Constellation, mean: Array, information: Array, reach: tuple[float, float]
+) -> Place:
+    """Return the best place about a pose."""
+    return find(seen, known, Prior(mean[None], information, reach))[0]
+
+
+def is_sure(place: Place) -> bool:
+    return place.odds >= SURE
+
+
 # --- the pose --------------------------------------------------------------------------------------------
 
 
 def test_a_few_cones_tell_the_pose_from_which_they_were_seen() -> None:
     """The information is that of each cone's distance, by the variances of both and of slow errors."""
     known = scattered()
-    laid = lay(beside(known, slice(10)), known, POSE + np.array([1.2, -0.9, 0.2]), NOTHING, REACH)
-    assert laid is not None and laid.is_sure
+    laid = best(beside(known, slice(10)), known, POSE + np.array([1.2, -0.9, 0.2]), NOTHING, REACH)
+    assert is_sure(laid)
     np.testing.assert_allclose(laid.pose, POSE, atol=1e-6)
-    assert laid.misfit == pytest.approx(0.0, abs=1e-9)
-    assert laid.count == 10
     arm = left_of(known.points[:10] - POSE[:2])
     by_turn, sum_of_squares = arm.sum(axis=0), np.sum(arm**2)
     expected = np.array([[10.0, 0.0, by_turn[0]], [0.0, 10.0, by_turn[1]], [*by_turn, sum_of_squares]])
-    np.testing.assert_allclose(laid.information, expected / (LAID_SIGMA**2 + 2.0 * COVARIANCE), atol=1e-3)
+    np.testing.assert_allclose(laid.information, expected / (FIT_SIGMA**2 + 2.0 * COVARIANCE), atol=1e-3)
 
 
 def test_a_cone_lies_on_one_of_its_own_colour_only() -> None:
     known = scattered()
     other = replace(beside(known, slice(12)), labels=1 - known.labels[:12])
-    laid = lay(other, known, POSE, NOTHING, REACH)
-    assert laid is None or not laid.is_sure
+    assert not is_sure(best(other, known, POSE, NOTHING, REACH))
 
 
-NEW_ROAD = ODOMETRY_FAILED + 20 * UNSEEN
-"""Cost of twenty cones where nothing was in view, after odometry has failed: less than in any wrong place."""
+NOWHERE = FAILED + 20 * 2.0 * log(1.0 / BY_CHANCE)
+"""Cost of twenty cones at none of the places, after odometry has failed: less than in any wrong place."""
 
 
 def test_what_is_expected_counts_until_odometry_has_failed() -> None:
     """The pose is a metre and a tenth of a radian off, which are one sigma each, or any number of them."""
     known, mean = scattered(), POSE + np.array([1.0, 0.0, 0.1])
-    for sigmas, cost in (((1.0, 1.0, 0.1), 2.0), ((0.01, 0.01, 0.001), ODOMETRY_FAILED)):
-        laid = lay(beside(known, slice(None)), known, mean, np.diag(np.array(sigmas) ** -2.0), REACH)
-        assert laid is not None
+    for sigmas, cost in (((1.0, 1.0, 0.1), 2.0), ((0.01, 0.01, 0.001), FAILED)):
+        laid = best(beside(known, slice(None)), known, mean, np.diag(np.array(sigmas) ** -2.0), REACH)
         np.testing.assert_allclose(laid.pose, POSE, atol=1e-6)
-        assert laid.odds == pytest.approx(NEW_ROAD - cost, abs=1e-3)
+        assert laid.odds == pytest.approx(0.5 * (NOWHERE - cost), abs=1e-3)
 
 
 @pytest.mark.parametrize("away", [(3.6, 0.0, 0.0), (-2.4, 2.6, 0.2)])
@@ -119,16 +124,16 @@ def test_a_place_far_from_where_it_is_expected_is_found_among_many_cones(
     """Wrong places near the mean have votes too, but the distance counts only until odometry has failed."""
     known = scattered(60)
     sure = np.diag(np.array([0.01, 0.01, 0.001]) ** -2.0)
-    laid = lay(beside(known, slice(30)), known, POSE + np.array(away), sure, REACH)
-    assert laid is not None and laid.is_sure
+    laid = best(beside(known, slice(30)), known, POSE + np.array(away), sure, REACH)
+    assert is_sure(laid)
     np.testing.assert_allclose(laid.pose, POSE, atol=1e-3)
 
 
 def test_the_heading_may_have_turned_around() -> None:
     known = scattered()
     mean = POSE + np.array([0.4, 0.4, 2.0 * np.pi])
-    laid = lay(beside(known, slice(None)), known, mean, np.diag([1.0, 1.0, 100.0]), REACH)
-    assert laid is not None and laid.odds == pytest.approx(NEW_ROAD - 0.32, abs=1e-6)
+    laid = best(beside(known, slice(None)), known, mean, np.diag([1.0, 1.0, 100.0]), REACH)
+    assert laid.odds == pytest.approx(0.5 * (NOWHERE - 0.32), abs=1e-6)
 
 
 def test_the_information_is_that_of_repeated_observations() -> None:
@@ -137,14 +142,13 @@ def test_the_information_is_that_of_repeated_observations() -> None:
     Cones whose errors are those of their covariances alone tell more than is claimed.
     """
     rng, known = np.random.default_rng(3), scattered(16)
-    variances = LAID_SIGMA**2 + 2.0 * COVARIANCE, 2.0 * COVARIANCE
+    variances = FIT_SIGMA**2 + 2.0 * COVARIANCE, 2.0 * COVARIANCE
     for variance, (least, most) in zip(variances, ((0.9, 1.6), (0.15, 0.4)), strict=True):
         squares = []
         for _ in range(300):
             noise = np.sqrt(variance) * rng.normal(size=known.points.shape)
             noisy = replace(known, points=known.points + noise)
-            laid = lay(noisy.seen_from(POSE), known, POSE, NOTHING, (1.0, 0.1))
-            assert laid is not None
+            laid = best(noisy.seen_from(POSE), known, POSE, NOTHING, (1.0, 0.1))
             off = laid.pose - POSE
             squares.append(off @ laid.information @ off / 3.0)
         assert least < np.mean(squares) < most
@@ -168,7 +172,7 @@ def test_the_compiled_places_are_those_in_numpy(seed: int) -> None:
         (seen, 0.01 * spread(2, 17), labels),
         (points + pose[:2], 0.01 * spread(2, 17), labels),
         views,
-        pose + np.array([0.7, -0.4, 0.1]),
+        pose + np.array([[0.7, -0.4, 0.1], [-3.0, 1.0, 0.0]]),
         0.1 * (spread(3)[0] + np.eye(3)),
         REACH,
         (0.25, 9.0, 0.5, 0.05, 1.0, 10.0, 2.0, 20.0),
@@ -179,69 +183,53 @@ def test_the_compiled_places_are_those_in_numpy(seed: int) -> None:
 
 # --- how sure it is --------------------------------------------------------------------------------------
 
-SURE = Laid(POSE, np.eye(3), LAID_CONES, LAID_MISFIT, LAID_ODDS)
 
-
-def test_each_limit_has_two_sides() -> None:
-    assert SURE.is_sure
-    for worse in ({"misfit": 1.01 * LAID_MISFIT}, {"count": LAID_CONES - 1}, {"odds": LAID_ODDS - 0.1}):
-        assert not replace(SURE, **worse).is_sure
-
-
-@pytest.mark.parametrize(("gone", "is_sure"), [(4, True), (5, False)])
-def test_most_cones_must_lie_on_earlier_ones(gone: int, is_sure: bool) -> None:
+@pytest.mark.parametrize(("gone", "fits"), [(4, True), (5, False)])
+def test_most_cones_must_lie_on_earlier_ones(gone: int, fits: bool) -> None:
     """A fifth of them may lie on none."""
     known = scattered()
     moved = known.points + np.where(np.arange(20) < gone, 50.0, 0.0)[:, None]
-    laid = lay(replace(known, points=moved).seen_from(POSE), known, POSE, NOTHING, REACH)
-    assert laid is not None
-    assert laid.misfit == pytest.approx(9.0 * gone / 20)
-    assert laid.is_sure is is_sure
+    place = best(replace(known, points=moved).seen_from(POSE), known, POSE, NOTHING, REACH)
+    assert (place.odds >= SURE) is fits
 
 
-@pytest.mark.parametrize(("sigmas", "is_sure"), [(1.35, True), (1.5, False)])
-def test_cones_that_lie_beside_others_do_not_agree(sigmas: float, is_sure: bool) -> None:
+@pytest.mark.parametrize(("sigmas", "fits"), [(1.35, True), (1.5, False)])
+def test_cones_that_lie_beside_others_do_not_agree(sigmas: float, fits: bool) -> None:
     """Half of them lie to one side and half to the other, by the same distance, which no motion explains."""
     points = np.array([[6.0 * (k // 4), 6.0 * (k % 4)] for k in range(16)])
-    off = sigmas * np.sqrt(LAID_SIGMA**2 + 2.0 * COVARIANCE) * np.where(np.arange(16) % 4 % 3, 1.0, -1.0)
+    off = sigmas * np.sqrt(FIT_SIGMA**2 + 2.0 * COVARIANCE) * np.where(np.arange(16) % 4 % 3, 1.0, -1.0)
     moved = points + np.column_stack([off, np.zeros(16)])
-    laid = lay(constellation(moved).seen_from(POSE), constellation(points), POSE, NOTHING, (0.4, 0.01))
-    assert laid is not None and laid.count == 16
-    assert laid.misfit == pytest.approx(sigmas**2, rel=1e-3)
-    assert laid.is_sure is is_sure
+    place = best(constellation(moved).seen_from(POSE), constellation(points), POSE, NOTHING, (0.4, 0.01))
+    assert (place.odds >= SURE) is fits
 
 
 @pytest.mark.parametrize(
-    ("sigma", "varied", "is_sure"), [(3.0, 0.0, False), (3.0, 0.8, True), (1.0, 0.0, True)]
+    ("sigma", "varied", "alone"), [(3.0, 0.0, False), (3.0, 0.8, True), (1.0, 0.0, True)]
 )
-def test_rows_at_regular_distances_fit_in_many_places(sigma: float, varied: float, is_sure: bool) -> None:
+def test_rows_at_regular_distances_fit_in_many_places(sigma: float, varied: float, alone: bool) -> None:
     """Rows at distances that vary (m) fit in one, and odometry that knows the place rules out others."""
     gaps, pose = 4.0 + np.random.default_rng(2).uniform(-varied, varied, 19), np.array([30.0, 0.0, 0.0])
     chosen, known = np.concatenate([np.arange(5, 13), np.arange(25, 33)]), row(gaps)
     information = np.diag([sigma**-2.0, sigma**-2.0, 100.0])
-    laid = lay(beside(known, chosen, pose), known, pose, information, (8.0, 0.1))
-    assert laid is not None and laid.misfit < 0.1
+    laid = best(beside(known, chosen, pose), known, pose, information, (8.0, 0.1))
     np.testing.assert_allclose(laid.pose, pose, atol=0.01)
-    assert laid.is_sure is is_sure
+    assert is_sure(laid) is alone
 
 
 AHEAD = np.array([[0.0, 0.0, 0.0, 15.0, 1.0], [10.0, 0.0, 0.0, 15.0, 1.0]])
 """Views from a pose at the start and from one 10 m on: cones behind the start were never in view."""
 
 
-@pytest.mark.parametrize(("views", "count", "is_sure"), [(AHEAD, 8, True), (None, 18, False)])
-def test_a_cone_where_nothing_was_in_view_is_not_asked(
-    views: Array | None, count: int, is_sure: bool
-) -> None:
+@pytest.mark.parametrize(("views", "fits"), [(AHEAD, True), (None, False)])
+def test_a_cone_where_nothing_was_in_view_is_not_asked(views: Array | None, fits: bool) -> None:
     """The vehicle is 4 m past its start. Ten of the cones that it has seen stand before the start."""
     both, pose = row(np.array([3.0, 5.0, 4.0, 6.0, 3.5, 5.5, 4.5, 3.0])), np.array([22.0, 0.0, 0.0])
     first = both.points[:, 0] > 20.0
     known = Constellation(both.points[first], both.covariances[first], both.labels[first])
     if views is not None:
         known = replace(known, views=views + np.array([18.0, 0.0, 0.0, 0.0, 0.0]))
-    laid = lay(both.seen_from(pose), known, pose, np.diag([1.0, 1.0, 100.0]), (8.0, 0.1))
-    assert laid is not None
-    assert (laid.count, laid.is_sure) == (count, is_sure)
+    laid = best(both.seen_from(pose), known, pose, np.diag([1.0, 1.0, 100.0]), (8.0, 0.1))
+    assert is_sure(laid) is fits
 
 
 def test_a_vehicle_that_is_not_back_yet_fits_a_gap_farther_along_a_row() -> None:
@@ -256,14 +244,16 @@ def test_a_vehicle_that_is_not_back_yet_fits_a_gap_farther_along_a_row() -> None
     known = replace(beside(both, np.flatnonzero(first), np.zeros(3)), views=AHEAD)
     seen = beside(both, np.flatnonzero(near), pose)
     for off in np.linspace(-3.0, 3.0, 7):
-        laid = lay(seen, known, pose + np.array([off, 0.0, 0.0]), np.diag([0.25, 1.0, 100.0]), (17.0, 0.3))
-        assert laid is not None and not laid.is_sure
+        laid = best(seen, known, pose + np.array([off, 0.0, 0.0]), np.diag([0.25, 1.0, 100.0]), (17.0, 0.3))
+        assert not is_sure(laid)
 
 
-@pytest.mark.parametrize(("seen", "known"), [(LAID_CONES - 1, 20), (LAID_CONES - 1, LAID_CONES - 1), (0, 20)])
-def test_a_few_cones_are_laid_on_none(seen: int, known: int) -> None:
+@pytest.mark.parametrize(("seen", "known"), [(LEAST_CONES - 1, 20), (20, LEAST_CONES - 1), (20, 0), (0, 20)])
+def test_a_few_cones_have_no_sure_place(seen: int, known: int) -> None:
     cones = scattered()
-    assert lay(beside(cones, slice(seen)), beside(cones, slice(known)), POSE, NOTHING, REACH) is None
+    prior = Prior(POSE[None], NOTHING, REACH)
+    places = find(beside(cones, slice(seen)), beside(cones, slice(known), np.zeros(3)), prior)
+    assert all(place.odds == -np.inf for place in places)
 
 
 # --- cones of detections ---------------------------------------------------------------------------------
@@ -287,13 +277,13 @@ def test_detections_are_merged_in_turn_as_tracks_are() -> None:
 def test_cones_are_seen_often_enough_near_enough_and_in_colour() -> None:
     """Each of four cones but the first lacks one of these."""
     near, far = [5.0, 1.0], [RANGE + 1.0, 0.0]
-    rows = [(near, LEFT)] * LAID_SIGHTINGS + [([5.0, -3.0], LEFT)] * (LAID_SIGHTINGS - 1)
-    rows += [(far, LEFT)] * LAID_SIGHTINGS + [([1.0, 4.0], UNKNOWN)] * LAID_SIGHTINGS
+    rows = [(near, LEFT)] * SIGHTINGS + [([5.0, -3.0], LEFT)] * (SIGHTINGS - 1)
+    rows += [(far, LEFT)] * SIGHTINGS + [([1.0, 4.0], UNKNOWN)] * SIGHTINGS
     points, labels = np.array([point for point, _ in rows]), np.array([label for _, label in rows])
     seen = Detections(0.0, points, np.tile(0.03 * np.eye(2), (len(rows), 1, 1)), labels)
     found = Constellation.of(DetectionColumns.of([seen]), POSE[None], GROWTH)
     np.testing.assert_allclose(found.points, to_map(np.array([near]), POSE[None]))
-    np.testing.assert_allclose(found.covariances, [0.03 / LAID_SIGHTINGS * np.eye(2)], atol=1e-12)
+    np.testing.assert_allclose(found.covariances, [0.03 / SIGHTINGS * np.eye(2)], atol=1e-12)
     np.testing.assert_array_equal(found.labels, [LEFT])
 
 
@@ -364,8 +354,8 @@ def test_a_round_of_a_skidpad_is_no_lap() -> None:
     """Its cones are met again as surely, but the newest path does not cross the start."""
     true = along(ENTRY, ON_ROUND, (10.0, -1.0 / 12.0))
     poses, seen_in = drifted(true), sensor(true)
-    found = find_return(seen_in, poses, 40.0, NEARBY, GROWTH)
-    assert found is not None and found[0].is_sure
+    found = find_return(seen_in, poses, 40.0, Prior.about(poses[-1], *NEARBY), SETTINGS)
+    assert found is not None
     assert return_to_beginning(seen_in, poses, UNCERTAIN, SETTINGS) is None
 
 
@@ -380,7 +370,9 @@ def test_another_road_beside_is_no_return(lane: float, is_same: bool) -> None:
     first = along((40.0, 0.0))
     elsewhere, beside_it = np.array([80.0, 40.0, 0.0]), np.array([0.0, lane, 0.0])
     true = np.concatenate([first, along((6.0, 0.0)) + elsewhere, first[10:60] + beside_it])
-    found = find_return(sensor(true), true, float(path_lengths(first)[-1]), NEARBY, GROWTH)
+    found = find_return(
+        sensor(true), true, float(path_lengths(first)[-1]), Prior.about(true[-1], *NEARBY), SETTINGS
+    )
     assert (found is not None) is is_same
     if found is not None:
         np.testing.assert_allclose(found[0].pose, true[-1], atol=0.1)
@@ -389,7 +381,7 @@ def test_another_road_beside_is_no_return(lane: float, is_same: bool) -> None:
 
 def test_a_pose_before_the_newest_moves_with_it() -> None:
     true = along(LAP, (20.0, 1.0 / 12.0))
-    laid = Laid(true[-1], np.eye(3), 20, 0.0, LAID_ODDS)
+    laid = Place(true[-1], np.eye(3), SURE)
     revisit = revisit_of(laid, true, 8, len(true) - 11)
     np.testing.assert_allclose(revisit.local, relative(true[8], true[-11]), atol=1e-9)
     assert (revisit.earlier, revisit.later) == (8, len(true) - 11)
@@ -398,18 +390,14 @@ def test_a_pose_before_the_newest_moves_with_it() -> None:
 def test_the_information_moves_with_the_pose() -> None:
     """The covariance in the frame of the earlier pose is that of samples, for an error of 1 cm and 1 mrad."""
     rng = np.random.default_rng(0)
-    frame, centre = np.array([4.0, 1.0, 0.7]), np.array([7.0, -3.0, 2.1])
-    arm = np.array([-6.0, 2.0, -0.4])
+    frame, later, newest = np.array([[4.0, 1.0, 0.7], [1.0, -1.0, 1.7], [7.0, -3.0, 2.1]])
     spread = rng.normal(size=(3, 3)) * np.array([[1e-2], [1e-2], [1e-3]])
     covariance = spread @ spread.T
-    later = compose(centre, relative(centre, centre + arm))
-    revisit = relative_pose((3, frame), (9, later), centre, np.linalg.inv(covariance))
+    place = Place(newest, np.linalg.inv(covariance), SURE)
+    revisit = revisit_of(place, np.array([frame, later, newest]), 0, 1)
     np.testing.assert_allclose(revisit.local, relative(frame, later))
     samples = rng.multivariate_normal(np.zeros(3), covariance, 20_000)
-    moved = np.empty_like(samples)
-    for k, (x, y, turn) in enumerate(samples):
-        position = centre[:2] + (x, y) + rotation(turn) @ (later[:2] - centre[:2])
-        moved[k] = relative(frame, np.append(position, later[2] + turn))
+    moved = np.array([relative(frame, compose(newest + off, relative(newest, later))) for off in samples])
     found = np.linalg.inv(revisit.root.T @ revisit.root)
     expected = np.cov(moved.T)
     size = np.sqrt(np.diagonal(expected))

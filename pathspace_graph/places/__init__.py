@@ -1,0 +1,1 @@
+"""Places on what is known: proposers, verifiers, and one decision by odds."""
