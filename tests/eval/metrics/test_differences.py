@@ -32,8 +32,5 @@ def test_a_bulge_is_told_with_its_place_length_and_distance() -> None:
     assert one.distance == pytest.approx(1.86, abs=0.02)  # a control point of 2 m
     half = 0.15 * np.sqrt(2.0 * np.log(2.0 / DIFFERENT)) * 17.0
     assert one.length == pytest.approx(2.0 * half, abs=1.5)
-    place = f"at x = {one.x:.1f} m, y = {one.y:.1f} m"
-    assert (
-        one.line
-        == f"the left boundary is up to {one.distance:.2f} m from the known map on {one.length:.0f} m, {place}"
-    )
+    off, place = f"{one.distance:.2f} m from the known map", f"at x = {one.x:.1f} m, y = {one.y:.1f} m"
+    assert one.line == f"the left boundary is up to {off} on {one.length:.0f} m, {place}"
