@@ -61,9 +61,9 @@ class ReportPlan:
             study = at_strength(study, 0.5)
             study = only(study, kinds(study)[:1]) if self.quick else study
         if self.quick:
-            study = smaller(
-                first_variant(study), about.get("quick", {"tracks": [0], "seeds": [0], "laps": 1})
-            )
+            grids = tuple({key: values[:1] for key, values in grid.items()} for grid in study.grids[:1])
+            study = replace(study, grids=grids, variants=dict([*study.variants.items()][:1]))
+            study = smaller(study, about.get("quick", {"tracks": [0], "seeds": [0], "laps": 1}))
         frame = run_study(study, folder, **self.how)
         if "beside" in about:
             other = run_study(smaller(study, about["beside"]), folder / "beside", **self.how)
@@ -119,12 +119,10 @@ class ReportPlan:
 
 EXPERIMENTS: Final[Mapping[str, Callable[[ReportPlan, Path], Tables]]] = {
     **dict.fromkeys(STUDIES, ReportPlan.study),
-    **{
-        "known": ReportPlan.known,
-        "joint": ReportPlan.joint,
-        "speed": ReportPlan.speed,
-        "scale": ReportPlan.scale,
-    },
+    "known": ReportPlan.known,
+    "joint": ReportPlan.joint,
+    "speed": ReportPlan.speed,
+    "scale": ReportPlan.scale,
     "real": ReportPlan.real_logs,
 }
 
@@ -140,12 +138,6 @@ def smaller(study: Study, parts: Mapping[str, Any]) -> Study:
     """Return a study with some parts replaced; of its noises those that are named are kept."""
     noise = {name: study.noise[name] for name in parts.get("noise", study.noise)}
     return replace(study, **{**parts, "noise": noise})
-
-
-def first_variant(study: Study) -> Study:
-    """Return a study with its first variant and the first value of its first grid."""
-    grids = tuple({key: values[:1] for key, values in grid.items()} for grid in study.grids[:1])
-    return replace(study, grids=grids, variants=dict([*study.variants.items()][:1]))
 
 
 def write_report(plan: ReportPlan, folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Table]]:

@@ -12,7 +12,7 @@ from rich.text import Text
 from tabulate import LATEX_ESCAPE_RULES
 
 from pathspace_graph.eval.figures.style import save_figures
-from pathspace_graph.eval.metrics.metric import HIGHER, LOWER, METRICS, UNKNOWN, Metric, figure
+from pathspace_graph.eval.metrics.metric import METRICS, UNKNOWN, Metric, figure
 from pathspace_graph.io.files import replacing, write_text
 
 from .plots import plot_differences
@@ -153,7 +153,7 @@ def results_table(
         column = contrasts(study, frame, metric.key)
         rows |= {name: [getattr(one, name) for one in column] for name in names}
         rows[metric.heading] = [_mean(metric, one.value) for one in column]
-        sign = (metric.key in LOWER) - (metric.key in HIGHER)
+        sign = (metric.best == "least") - (metric.best == "most")
         means = pd.Series([sign * one.value.mean for one in column])
         of_noise = means.groupby([one.noise for one in column])
         differs = (of_noise.transform("nunique") > 1) & bool(sign)
