@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, ScalarFormatter, StrMethodFormatter
 from numpy.random import Generator
 from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
@@ -554,11 +554,13 @@ def plot_scaling(scaling: Scaling) -> Figure:
                 if sweep == CONES and slope["stopped"]:
                     axes.plot(at.iloc[-1], milliseconds.iloc[-1], "x", color=color, markersize=10.8)
             axes.set(xscale="log", yscale="log", xlabel=abscissa, title=title)
-            style.label_logarithms(axes)
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
             axes.grid(which="both")
             axes.xaxis.set_major_locator(FixedLocator(ticks[sweep]))
             axes.xaxis.set_major_formatter(ScalarFormatter())
             axes.xaxis.set_minor_formatter(NullFormatter())
         panels[0].set_ylabel("mean update [ms]")
-        style.shared_legend(figure, columns=min(len(scaling.estimators), 4))
+        style.shared_legend(figure)
     return figure

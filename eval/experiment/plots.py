@@ -75,7 +75,7 @@ def plot_maps(drawn: Mapping[str, Drawn], truth: Truth | None) -> Figure:
             if number + columns >= len(drawn):
                 axes.set_xlabel("x [m]")
                 axes.tick_params(labelbottom=True)
-        style.grouped_legend(figure)
+        style.shared_legend(figure)
         style.fit_height(figure)
     return figure
 

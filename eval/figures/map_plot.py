@@ -151,7 +151,7 @@ def finish(figure: Figure, axes: Axes, title: str | None) -> None:
     low, high = drawn[:, 0] - MARGIN, drawn[:, 1] + MARGIN
     style.set_frame(axes, low, high)
     axes.set(xlabel="x [m]", ylabel="y [m]", title=title or "")
-    style.grouped_legend(figure)
+    style.shared_legend(figure)
     width, height = high - low
     figure.set_size_inches(WIDTH, min(7.5, WIDTH * height / width + 0.85))
 

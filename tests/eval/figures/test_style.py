@@ -17,7 +17,6 @@ from pathspace_graph.eval.figures.style import (
     ellipse_outlines,
     figure_context,
     fit_height,
-    grouped_legend,
     point_blocks,
     save_figures,
     save_plot,
@@ -44,27 +43,10 @@ def texts(figure: Figure) -> list[str]:
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
-def test_a_shared_legend_names_each_thing_once() -> None:
-    figure = two_panels(["spline", "truth"], ["truth", "landmarks"])
-    shared_legend(figure, 3)
-    assert texts(figure) == ["spline", "truth", "landmarks"]
-
-
-def test_a_grouped_legend_has_a_column_for_each_boundary_and_then_the_rest() -> None:
-    """Columns have three rows, as the left boundary has; blanks fill the column of the right one."""
-    figure = two_panels(["left band", "right band", "left boundary", "cones"], ["left points", "start"])
-    grouped_legend(figure)
-    assert texts(figure) == [
-        *("left band", "left boundary", "left points"),
-        *("right band", "", ""),
-        *("cones", "start", ""),
-    ]
-
-
-def test_a_grouped_legend_needs_no_boundary() -> None:
-    figure = two_panels(["start"], [])
-    grouped_legend(figure)
-    assert texts(figure) == ["start"]
+def test_a_shared_legend_names_each_thing_once_a_boundary_after_the_other() -> None:
+    figure = two_panels(["start", "right band", "left band"], ["left band", "left boundary"])
+    shared_legend(figure)
+    assert texts(figure) == ["left band", "left boundary", "right band", "start"]
 
 
 def test_a_figure_is_as_high_as_what_is_drawn_and_a_margin() -> None:

@@ -29,6 +29,8 @@ from pathspace_graph.spline.bspline import BSpline
 
 from .straight_maps import landmarks, line, row, truth
 
+Array = NDArray[np.float64]
+
 
 def test_errors_of_a_curve_are_one_for_each_control_point_and_have_its_covariance() -> None:
     error, covariance = curve_errors(line(2.3, sigma=0.2), true_curve(truth(row(2.0)), LEFT), np.zeros(2))
@@ -135,8 +137,6 @@ def test_an_exact_map_off_by_some_sigmas_of_its_turn_or_size_adds_their_square(
         values.append(map_nees(Map(True, {LEFT: boundary}), truth(cones)).value)
     np.testing.assert_allclose(np.subtract(values, values[0]), [0.0, 1.0, 4.0, 9.0], rtol=0.1, atol=0.1)
 
-
-Array = NDArray[np.float64]
 
 FAR = (10.0, 50.0, 90.0)
 
