@@ -122,13 +122,6 @@ def uncertainty_band(boundary: SplineBoundary, u: Array, scale: float = 1.0) -> 
     return centre + offsets, centre - offsets
 
 
-def point_blocks(covariance: Array) -> Array:
-    """Return each point's covariance (m, 2, 2) from the joint one (2m, 2m) over x0, y0, x1, y1 and so on."""
-    m = len(covariance) // 2
-    index = np.arange(m)
-    return np.asarray(covariance.reshape(m, 2, m, 2)[index, :, index, :])
-
-
 def draw_curve(
     axes: Axes,
     spline: BSpline,
@@ -176,7 +169,9 @@ def ellipse_outlines(points: Array, joint: Array, scale: float = 1.0) -> Array:
 
     The joint covariance (2m, 2m) is over x0, y0, x1, y1 and so on.
     """
-    variances, vectors = np.linalg.eigh(point_blocks(joint))
+    m = np.arange(len(points))
+    blocks = joint.reshape(len(points), 2, len(points), 2)[m, :, m, :]  # covariance of each point (m, 2, 2)
+    variances, vectors = np.linalg.eigh(blocks)
     angles = np.linspace(0.0, 2.0 * np.pi, 33)
     circle = SIGMAS * scale * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     axes = vectors * np.sqrt(np.maximum(variances, 0.0))[:, None, :]

@@ -72,7 +72,17 @@ def maps_apart(track: Map, reference: Map) -> MapsApart:
         raise SettingsError("maps: expected a boundary that both have, found none")
     first, second = ([of.boundaries[label] for label in shared] for of in (track, reference))
     points, others = ([mapped_points(boundary, STEP) for boundary in of] for of in (first, second))
-    tries = [_apart(shared, points, others, first, second, start) for start in _starts(points, others)]
+    tries = []
+    for start in _starts(points, others):
+        motion = aligning(points, second, start)
+        back, both, distances = inverse(motion), dict[int, Array](), dict[int, Array]()
+        for k, label in enumerate(shared):
+            moved, returned = move_points(motion, points[k]), move_points(back, others[k])
+            both[label] = np.concatenate([moved, others[k]])
+            ways = boundary_distances(second[k], moved), boundary_distances(first[k], returned)
+            distances[label] = np.concatenate(ways)
+        motion = np.append(motion[:2], wrap_angle(motion[2:]))
+        tries.append(MapsApart(motion, both, distances))
     return min(tries, key=lambda one: one.mean)
 
 
@@ -93,25 +103,6 @@ def shape_rmse(track: Map, truth: Truth) -> float:
     pairs = zip(boundaries, cones, strict=True)
     distances = [boundary_distances(boundary, move_points(motion, own)) for boundary, own in pairs]
     return root_mean_square(np.concatenate([np.zeros(0), *distances]))
-
-
-def _apart(
-    labels: Sequence[int],
-    points: Sequence[Array],
-    others: Sequence[Array],
-    first: Sequence[MapBoundary],
-    second: Sequence[MapBoundary],
-    start: Array,
-) -> MapsApart:
-    motion = aligning(points, second, start)
-    back, both, distances = inverse(motion), dict[int, Array](), dict[int, Array]()
-    for k, label in enumerate(labels):
-        moved, returned = move_points(motion, points[k]), move_points(back, others[k])
-        both[label] = np.concatenate([moved, others[k]])
-        ways = boundary_distances(second[k], moved), boundary_distances(first[k], returned)
-        distances[label] = np.concatenate(ways)
-    motion = np.append(motion[:2], wrap_angle(motion[2:]))
-    return MapsApart(motion, both, distances)
 
 
 def _starts(points: Sequence[Array], others: Sequence[Array]) -> list[Array]:

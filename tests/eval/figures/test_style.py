@@ -17,7 +17,6 @@ from pathspace_graph.eval.figures.style import (
     ellipse_outlines,
     figure_context,
     fit_height,
-    point_blocks,
     save_figures,
     save_plot,
     set_frame,
@@ -141,12 +140,6 @@ def test_every_span_is_sampled_from_end_to_end() -> None:
     u = curve_parameters(spline, 4)
     assert (u[0], u[-1], len(u)) == (0.0, 9.0, 13)
     assert set(spline.breaks) <= set(u)
-
-
-def test_a_points_own_covariance_is_a_block_of_the_joint_one() -> None:
-    joint = np.arange(36.0).reshape(6, 6)
-    np.testing.assert_array_equal(point_blocks(joint)[1], joint[2:4, 2:4])
-    assert point_blocks(np.zeros((0, 0))).shape == (0, 2, 2)
 
 
 def test_an_outline_of_an_ellipse_is_two_sigma_away_in_every_direction() -> None:
