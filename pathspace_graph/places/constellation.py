@@ -33,6 +33,7 @@ SIGHTINGS: Final = 3  # least number of detections of a cone
 LINE_WEIGHT: Final = 0.25
 """Weight of a point of a line, merged to about 1 m: neighbours on a line say the same for 4 m."""
 
+CURVE_SIGMA: Final = 0.12  # standard deviation added across a curve, which passes slow errors by (m)
 CURVE_STEP: Final = 0.2  # step of the sampled curves (m)
 REGULAR: Final[Array] = np.diag([1e-2, 1e-2, 1.0])  # information without any curve (1/m^2, 1/m^2, 1/rad^2)
 CURVE_GATES: Final = (3.0, 2.1, 1.5, 1.0, 0.7, 0.5)  # largest distance from a curve, by iteration (m)
@@ -95,7 +96,12 @@ class Constellation:
 
     @classmethod
     def of(
-        cls, table: DetectionColumns, poses: Array, settings: GrowthSettings, *, of_lines: bool = False
+        cls,
+        table: DetectionColumns,
+        poses: Array,
+        settings: GrowthSettings,
+        *,
+        of_lines: bool = False,
     ) -> Self:
         """Merge detections, the most certain first, to cones in the map frame, by poses (P, 3) of cycles."""
         point = table.point
@@ -228,7 +234,7 @@ class SampledCurves:
             last = len(self.points[label]) - 1
             inside[own] = (not self.open) | ((nearest > 0) & (nearest < last))
         turning = (normal * left_of(points - pose[:2])).sum(axis=1)
-        variance = np.einsum("mi,mij,mj->m", normal, covariances, normal) + FIT_SIGMA**2
+        variance = np.einsum("mi,mij,mj->m", normal, covariances, normal) + CURVE_SIGMA**2
         return off, np.column_stack([normal, turning]), variance, inside
 
 

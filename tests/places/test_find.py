@@ -9,7 +9,7 @@ from scipy.spatial.distance import pdist
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, path_lengths
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.places.constellation import LINE_WEIGHT, Constellation, Prior, SampledCurves
+from pathspace_graph.places.constellation import CURVE_SIGMA, LINE_WEIGHT, Constellation, Prior, SampledCurves
 from pathspace_graph.places.find import (
     HYPOTHESES_APART,
     LEAST_CONES,
@@ -157,7 +157,7 @@ def test_points_are_laid_across_curves_and_not_along() -> None:
     assert fits.counts[0] == pytest.approx(4 * LINE_WEIGHT)
     assert fits.squares[0] == pytest.approx(0.0, abs=1e-6)
     assert fits.information[0, 0, 0] < 0.02
-    assert fits.information[0, 1, 1] == pytest.approx(0.01 + 4 * LINE_WEIGHT / 0.25**2)
+    assert fits.information[0, 1, 1] == pytest.approx(0.01 + 4 * LINE_WEIGHT / CURVE_SIGMA**2)
 
 
 def test_beyond_the_end_of_an_open_curve_nothing_is_in_view() -> None:
