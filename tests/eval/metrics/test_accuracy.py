@@ -12,6 +12,7 @@ from pathspace_graph.eval.metrics.accuracy import (
     boundary_distances,
     cone_distances,
     cone_errors,
+    crossings,
     curve_distance,
     driving_order,
     ghosts,
@@ -192,3 +193,13 @@ def test_ghost_curve_is_the_length_with_no_boundary_near() -> None:
     assert found["ghost_landmarks"] == 0
     whole = ghosts(Map(False, {LEFT: line(2.0)}), truth(np.zeros((0, 2))))
     assert whole["ghost_metres"] == pytest.approx(10.0)
+
+
+def test_curves_that_cross_are_counted_once_a_place() -> None:
+    """A lying eight crosses itself once, and a circle around its middle four times."""
+    eight = np.column_stack([20.0 * np.sin(ANGLE), 10.0 * np.sin(2.0 * ANGLE)])
+    circle = 15.0 * np.column_stack([np.cos(ANGLE), np.sin(ANGLE)])
+    curves = (BSpline.periodic_from(np.arange(25.0), points) for points in (eight, circle))
+    boundaries = {label: SplineBoundary(curve, np.eye(48)) for label, curve in enumerate(curves)}
+    assert crossings(Map(True, {LEFT: boundaries[LEFT], RIGHT: boundaries[RIGHT]})) == (4, 1)
+    assert crossings(Map(True, {LEFT: boundaries[RIGHT], RIGHT: landmarks((0.0, 0.0))})) == (0, 0)
