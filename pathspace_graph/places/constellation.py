@@ -36,7 +36,7 @@ LINE_WEIGHT: Final = 0.25
 CURVE_SIGMA: Final = 0.12  # standard deviation added across a curve, which passes slow errors by (m)
 CURVE_STEP: Final = 0.2  # step of the sampled curves (m)
 REGULAR: Final[Array] = np.diag([1e-2, 1e-2, 1.0])  # information without any curve (1/m^2, 1/m^2, 1/rad^2)
-CURVE_GATES: Final = (3.0, 2.1, 1.5, 1.0, 0.7, 0.5)  # largest distance from a curve, by iteration (m)
+CURVE_GATES: Final = (3.0, 2.0, 1.2, 0.7)  # largest distance from a curve, by iteration (m)
 
 Cones = tuple[Array, Array, IntArray]
 """Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""

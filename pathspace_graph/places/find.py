@@ -24,7 +24,8 @@ from .constellation import APART, CURVE_STEP, FAILED, UNSEEN, Constellation, Kno
 SURE: Final = 7.0  # least log odds of a place where a wrong one costs the map: a thousand to one
 LEAST_CONES: Final = 6  # least number of cones in view at a place
 MOST_MISFIT: Final = 2.0  # largest mean capped square of these: the expectation of matching cones in 2D
-BY_CHANCE: Final = 0.6
+MOST_PLACES: Final = 3  # largest number of places returned
+BY_CHANCE: Final = 0.55
 """Probability that a cone lies on some other by chance, at a wrong place where its neighbours do."""
 
 WAY_STEP: Final = 2.0  # step of the points of a way (m)
@@ -32,7 +33,7 @@ LEAD: Final = 4.0  # distance ahead of the vehicle of an additional point of its
 MISFIT_OF_WAY: Final = 3.0  # largest rms distance of an aligned path from the way (m)
 HYPOTHESES_APART: Final = 6.0  # least distance of hypotheses along the way (m)
 AT_HYPOTHESIS: Final = (3.0, 3.0, 0.2), (6.0, 0.2)  # sigmas and reach of the pose about one (m, m, rad)
-MOST_HYPOTHESES: Final = 24  # largest number of hypotheses, those of the best shape
+MOST_HYPOTHESES: Final = 16  # largest number of hypotheses, those of the best shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class Place:
 
 
 def find(seen: Constellation, known: Known, prior: Prior) -> list[Place]:
-    """Find the places where cones or lines, seen in the vehicle frame, lie on known ones; the best first.
+    """Find the best places where cones or lines, seen in the vehicle frame, lie on known ones, in order.
 
     The cost of a place is the sum of capped squares of what lies in view of the known there, plus the squared
     Mahalanobis distance from the prior, up to `FAILED`. What is out of view costs as much as at the next best
@@ -66,6 +67,8 @@ def find(seen: Constellation, known: Known, prior: Prior) -> list[Place]:
     order, places = np.argsort(costs, kind="stable"), list[Place]()
     for i in order.tolist():
         pose = fits.poses[i]
+        if len(places) == MOST_PLACES:
+            break
         if any(np.hypot(*(pose - other.pose)[:2]) <= APART for other in places):
             continue
         others = np.hypot(*(fits.poses - pose)[:, :2].T) > APART
