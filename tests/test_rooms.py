@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from .scenes.paths import PACKAGE, ROOT, modules, room_of
+from .scenes.paths import PACKAGE, modules, room_of
 
 ROS = {"rclpy", *(f"{name}_msgs" for name in ("geometry", "nav", "sensor", "std", "tf2", "visualization"))}
 EXTRAS = {"distributed", "rerun", "rosbags", "builtin_interfaces"} | ROS
