@@ -5,7 +5,7 @@
 namespace kernels {
 namespace {
 
-struct ConePoints {  // places.constellation:Cones
+struct ConePoints {  // places.constellation:ConeArrays
   ConePoints() = default;
   explicit ConePoints(const py::tuple& columns) {
     const auto points = columns[0].cast<Array>(), covariances = columns[1].cast<Array>();
@@ -42,7 +42,7 @@ struct ConePoints {  // places.constellation:Cones
   Index n = 0;
 };
 
-struct LayLimits {  // places.constellation:LIMITS
+struct LayLimits {  // places.constellation:FIT_LIMITS
   explicit LayLimits(const py::tuple& limits)
       : sigma(limits[0].cast<double>()),
         gate(limits[1].cast<double>()),

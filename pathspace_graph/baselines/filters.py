@@ -17,8 +17,8 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
-from pathspace_graph.places.constellation import Constellation, Prior, SampledCurves
-from pathspace_graph.places.find import SURE, find
+from pathspace_graph.places.constellation import BEGINNING, Constellation, Prior, SampledCurves, beginning_of
+from pathspace_graph.places.find import SURE_ODDS, find
 from pathspace_graph.places.passes import LAP_TURNED, tried_along
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.spline.bspline import BSpline
@@ -29,7 +29,7 @@ from .ckf_update import OnCurve, classify, update
 from .landmark_association import ROUGH_GATE, associate, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 from .online import FRONT_END, OnlineBaseline
-from .periodic import BEGINNING, BEGINNING_SHARE, JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
+from .periodic import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
 
 FILTER_REACH: Final = (
     9.0  # largest distance ahead of the vehicle of a curve's end (m along the predicted path)
@@ -129,13 +129,12 @@ def associate_early_segment(
     """
     splines = {label: state.spline(label) for label in state.curves}
     ends = {label: spline.domain[1] for label, spline in splines.items()}
-    early = {label: min(BEGINNING, BEGINNING_SHARE * end) for label, end in ends.items()}
     poses, table = np.array([pose for pose, _ in cycles]), DetectionColumns.of([seen for _, seen in cycles])
     seen = Constellation.of(table, poses, state.settings.growth).seen_from(poses[-1])
     information = np.asarray(np.linalg.inv(state.belief.covariance[:POSE, :POSE]), np.float64)
     prior = tried_along(beginning, Prior(poses[-1:], information, (reach, LAP_TURNED)))
-    places = find(seen, SampledCurves.of(splines, early), prior)
-    if not places or places[0].odds < SURE:
+    places = find(seen, SampledCurves.of(splines, ends), prior)
+    if not places or places[0].odds < SURE_ODDS:
         return None
     return compose(places[0].pose, inverse(poses[-1]))
 
@@ -174,7 +173,7 @@ def _overlap(state: CurveState, label: int, motion: Array) -> tuple[Array, Array
     u = np.arange(max(high - BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
     moved = move_points(motion, spline.evaluate(u))
     zero = np.zeros(len(u))
-    beginning = min(BEGINNING, BEGINNING_SHARE * high)
+    beginning = beginning_of(high)
     foot = state.foot_points(label, moved, zero, zero + beginning)
     on = foot.interior & (np.abs(foot.distance) < TIE_REACH)
     return u[on], foot.u[on]

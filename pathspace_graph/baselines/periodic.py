@@ -7,13 +7,12 @@ import numpy as np
 
 from pathspace_graph.batch.association import LINE_STEP
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.places.constellation import BEGINNING
 from pathspace_graph.settings.mapper import Knots, MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import curvature_weighted_breaks, refit, thin
 
-BEGINNING: Final = 60.0  # length of an open curve that counts as its beginning (m)
-BEGINNING_SHARE: Final = 0.6  # largest share of a short curve that counts as its beginning
 EXTRAPOLATED: Final = 2  # knot intervals past the confirmed end that map to the closed curve
 JOIN_MARGIN: Final = 10.0  # with `BEGINNING`, largest distance of the seam from the end of a curve (m)
 JOIN_SHARE: Final = 0.5  # least parameter of the seam on a short curve, as a share of its length

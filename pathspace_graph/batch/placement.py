@@ -11,12 +11,12 @@ from pathspace_graph.factors.se2 import compose, inverse, path_lengths
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.places.constellation import Constellation, Prior
-from pathspace_graph.places.find import SURE, KnownRoad, Place, find
+from pathspace_graph.places.find import SURE_ODDS, KnownRoad, Place, find
 from pathspace_graph.places.passes import seen_in
 from pathspace_graph.settings.mapper import MapperSettings
 
 LEAST_DRIVEN: Final = 30.0  # least length of a drive (m)
-STRETCH: Final = 60.0  # length of a stretch of a drive that determines its place (m)
+PLACED_STRETCH: Final = 60.0  # length of a stretch of a drive that determines its place (m)
 FROM_START: Final = 60.0  # length of the first path, whose cones determine the place on an open road (m)
 ABOUT_START: Final = (5.0, 2.0, 0.1), (15.0, 0.3)
 """Sigmas (m, m, rad) and largest distance (m, rad) of the starts of two drives of an open road."""
@@ -80,11 +80,11 @@ def find_place(known: Driven, drive: Driven) -> Array:
 
 def _by_stretches(road: KnownRoad, drive: Driven) -> tuple[Array | None, bool]:
     """Return the motion of the first stretch with a sure place, and whether one fits anywhere."""
-    fits, ends = False, np.arange(STRETCH, float(drive.driven[-1]) + STRETCH, STRETCH)
+    fits, ends = False, np.arange(PLACED_STRETCH, float(drive.driven[-1]) + PLACED_STRETCH, PLACED_STRETCH)
     for end in np.minimum(ends, drive.driven[-1]).tolist():
-        within = (drive.driven >= end - STRETCH) & (drive.driven <= end)
+        within = (drive.driven >= end - PLACED_STRETCH) & (drive.driven <= end)
         poses = drive.state.poses[within]
-        seen = drive.seen(end - STRETCH, end).seen_from(poses[-1])
+        seen = drive.seen(end - PLACED_STRETCH, end).seen_from(poses[-1])
         places = find(seen, road.seen, road.along(poses))
         if _is_sure(places):
             return compose(places[0].pose, inverse(poses[-1])), True
@@ -93,4 +93,4 @@ def _by_stretches(road: KnownRoad, drive: Driven) -> tuple[Array | None, bool]:
 
 
 def _is_sure(places: list[Place]) -> bool:
-    return bool(places) and places[0].odds >= SURE
+    return bool(places) and places[0].odds >= SURE_ODDS

@@ -21,7 +21,7 @@ from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.places.constellation import Constellation, Prior
-from pathspace_graph.places.find import SURE, KnownRoad, Place, find
+from pathspace_graph.places.find import SURE_ODDS, KnownRoad, Place, find
 
 from .drive import Drive, Phase, Step
 
@@ -32,7 +32,7 @@ SEARCH_CONES: Final = 30.0  # length of the newest path whose cones are in use; 
 LEAST_PATH: Final = 20.0  # least length of the path without a given start (m)
 AT_START: Final = (1.0, 1.0, 0.2), (4.0, 0.5)  # sigmas and reach of a given start (m, m, rad)
 WIDENING: Final = 3.0  # inflation of the sigmas of a place: its detections are used again
-STEPS: Final = 2  # Gauss-Newton steps after the restart
+RESTART_STEPS: Final = 2  # Gauss-Newton steps after the restart
 
 
 class Search(Copyable):
@@ -79,7 +79,7 @@ class Search(Copyable):
         table = DetectionColumns.of(self._seen[first:], first)
         seen = Constellation.of(table, poses, self.settings.growth, of_lines=of_lines).seen_from(poses[-1])
         places = find(seen, self.known.seen, prior)
-        return places[0] if places and places[0].odds >= SURE else None
+        return places[0] if places and places[0].odds >= SURE_ODDS else None
 
 
 class Lost(Phase):
@@ -129,7 +129,7 @@ def restart_window(smoother: CurveSmoother, first_cycle: int, place: Place) -> A
     smoother.add_pose_prior(smoother.next_cycle - 1, widened(place))
     locate_poses(state)
     smoother.reassociate()
-    for _ in range(STEPS):
+    for _ in range(RESTART_STEPS):
         smoother.step(settings.sigma_step)
     jump = state.poses[-1] - before
     return np.append(jump[:2], wrap_angle(jump[2]))

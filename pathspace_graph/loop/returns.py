@@ -14,8 +14,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .drive_record import DriveRecord
 
-BEGINNING: Final = 60.0  # length of the curves that counts as their beginning (m)
-BEGINNING_SHARE: Final = 0.6  # largest share of a short curve that counts as its beginning
 RETURN_CYCLES: Final = 10  # number of cycles between attempts of a vehicle that hardly moves
 
 
@@ -46,8 +44,7 @@ class ReturnFinder(Copyable):
             smoother.transform_to_origin()
             smoother.refresh()
             ends = {label: boundary.confirmed_end for label, boundary in road.boundaries.items()}
-            beginning = {label: min(BEGINNING, BEGINNING_SHARE * end) for label, end in ends.items()}
-            curves = SampledCurves.of(smoother.map.state.splines, beginning)
+            curves = SampledCurves.of(smoother.map.state.splines, ends)
         seen_in = record.seen_in(smoother.variables.sensor, noise)
         poses = unwrap(record.poses) if curves is None else record.with_window(road)
         return return_to_beginning(seen_in, poses, smoother.newest_covariance(), road.settings, curves)

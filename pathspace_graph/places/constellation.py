@@ -19,28 +19,30 @@ from pathspace_graph.spline.bspline import BSpline
 
 FIT_SIGMA: Final = 0.25  # standard deviation added to a cone's covariance, for slow errors of the sensor (m)
 FIT_GATE: Final = 9.0  # cap of a cone's square (sigmas^2); beyond it, the cone lies on no other
-CELL: Final = 0.5  # cell size of the votes (m)
-TURN: Final = 0.05  # step of the headings (rad)
-APART: Final = 1.0  # least distance of two different places (m)
+VOTE_CELL: Final = 0.5  # cell size of the votes (m)
+VOTE_TURN: Final = 0.05  # step of the headings (rad)
+PLACES_APART: Final = 1.0  # least distance of two different places (m)
 PLACES: Final = 10  # largest number of places for each heading, and a third of those refined
 UNSEEN: Final = 2.0  # largest cost of a cone out of view: the expectation of a matching one in 2D
 FAILED: Final = 20.0  # largest cost of the distance from a prior: twice the log odds against its failure
-LIMITS: Final = (FIT_SIGMA, FIT_GATE, CELL, TURN, APART, float(PLACES), UNSEEN, FAILED)
-RANGE: Final = 16.0  # largest range of merged detections (m)
+FIT_LIMITS: Final = (FIT_SIGMA, FIT_GATE, VOTE_CELL, VOTE_TURN, PLACES_APART, float(PLACES), UNSEEN, FAILED)
+MERGE_RANGE: Final = 16.0  # largest range of merged detections (m)
 VIEWED: Final = 0.95  # share of the detections within the range and the bearing of a view
 VIEWS: Final = 2.0  # distance of the views along a path (m)
-SIGHTINGS: Final = 3  # least number of detections of a cone
+CONE_SIGHTINGS: Final = 3  # least number of detections of a cone
 LINE_WEIGHT: Final = 0.25
 """Weight of a point of a line, merged to about 1 m: neighbours on a line say the same for 4 m."""
 
 CURVE_SIGMA: Final = 0.12  # standard deviation added across a curve, which passes slow errors by (m)
 CURVE_STEP: Final = 0.2  # step of the sampled curves (m)
+BEGINNING: Final = 60.0  # length of open curves that counts as their beginning (m)
+BEGINNING_SHARE: Final = 0.6  # largest share of a short curve that counts as its beginning
 REGULAR: Final[Array] = np.diag([1e-2, 1e-2, 1.0])  # information without any curve (1/m^2, 1/m^2, 1/rad^2)
-CURVE_GATES: Final = (3.0, 2.1, 1.5, 1.0, 0.7, 0.5)  # largest distance from a curve, by iteration (m)
+CURVE_GATES: Final = (3.0, 2.0, 1.2, 0.7)  # largest distance from a curve, by iteration (m)
 
-Cones = tuple[Array, Array, IntArray]
+ConeArrays = tuple[Array, Array, IntArray]
 """Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
-NO_CONES: Final[Cones] = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
+NO_FIT_CONES: Final[ConeArrays] = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
 EVERYWHERE: Final[Array] = np.array([[0.0, 0.0, 0.0, inf, inf]])
 """View of a complete constellation."""
 
@@ -105,15 +107,15 @@ class Constellation:
     ) -> Self:
         """Merge detections, the most certain first, to cones in the map frame, by poses (P, 3) of cycles."""
         point = table.point
-        rows = np.flatnonzero((table.label != UNKNOWN) & (np.hypot(*point.T) < RANGE))
+        rows = np.flatnonzero((table.label != UNKNOWN) & (np.hypot(*point.T) < MERGE_RANGE))
         rows = rows[np.argsort(np.trace(table.covariance[rows], axis1=1, axis2=2), kind="stable")]
         at = poses[table.cycle[rows]]
         points, covariances = to_map(point[rows], at), rotated(table.covariance[rows], at[:, 2])
-        labels, found = table.label[rows], [NO_CONES]
+        labels, found = table.label[rows], [NO_FIT_CONES]
         for label in np.unique(labels).tolist():
             own = labels == label
             places, information, counts = merged_in_turn(points[own], covariances[own], settings)
-            seen = counts >= SIGHTINGS
+            seen = counts >= CONE_SIGHTINGS
             covariance = np.asarray(np.linalg.inv(information[seen]), np.float64)
             found.append((places[seen], covariance, np.full(len(covariance), label)))
         places, covariances, labels = (np.concatenate(column) for column in zip(*found, strict=True))
@@ -124,7 +126,7 @@ class Constellation:
         return len(self.labels)
 
     @property
-    def cones(self) -> Cones:
+    def cones(self) -> ConeArrays:
         return self.points, self.covariances, self.labels
 
     def seen_from(self, pose: Array) -> Self:
@@ -143,7 +145,7 @@ class Constellation:
         poses with most votes near the prior's are refined on a sum of capped squares.
         """
         places = kernels.laid(
-            seen.cones, self.cones, self.views, prior.poses, prior.information, prior.reach, LIMITS
+            seen.cones, self.cones, self.views, prior.poses, prior.information, prior.reach, FIT_LIMITS
         )
         return Fits(*places)
 
@@ -170,16 +172,16 @@ class SampledCurves:
     open: bool  # whether a point beyond an end is out of view
 
     @classmethod
-    def of(cls, splines: Mapping[int, BSpline], length: Mapping[int, float] | None = None) -> Self:
-        """Sample curves, or the beginning of each up to a length (m)."""
+    def of(cls, splines: Mapping[int, BSpline], ends: Mapping[int, float] | None = None) -> Self:
+        """Sample curves, or the beginning of open ones with confirmed ends (m)."""
         points, normals = dict[int, Array](), dict[int, Array]()
         for label, spline in splines.items():
             low, high = spline.domain
-            end = min(high, low + length[label]) if length is not None else high
+            end = high if ends is None else min(high, beginning_of(ends[label]))
             u = np.linspace(low, end, max(int((end - low) / CURVE_STEP), 1) + 1)
             points[label], normals[label] = spline.evaluate(u), left_of(spline.tangent_unit(u))
         trees = {label: KDTree(curve) for label, curve in points.items()}
-        is_open = length is not None or not all(spline.periodic for spline in splines.values())
+        is_open = ends is not None or not all(spline.periodic for spline in splines.values())
         return cls(points, normals, trees, is_open)
 
     def relabelled(self, labels: Mapping[int, int]) -> Self:
@@ -236,6 +238,11 @@ class SampledCurves:
         turning = (normal * left_of(points - pose[:2])).sum(axis=1)
         variance = np.einsum("mi,mij,mj->m", normal, covariances, normal) + CURVE_SIGMA**2
         return off, np.column_stack([normal, turning]), variance, inside
+
+
+def beginning_of(end: float) -> float:
+    """Return the length (m) of the beginning of an open curve that is confirmed up to an end (m)."""
+    return min(BEGINNING, BEGINNING_SHARE * end)
 
 
 def _difference(pose: Array, other: Array) -> Array:

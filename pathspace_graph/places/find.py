@@ -1,6 +1,6 @@
 """Find the place of a vehicle on what is known, by hypotheses, fits and odds.
 
-A prior or the shape of the driven path proposes poses, and cones or curves verify them. Cones stand at
+A prior or the shape of the driven path proposes poses, and cones or curves verify them. ConeArrays stand at
 regular distances, so a few of them fit in many places. A place has log odds against every rival: the other
 places, and that the vehicle is at none of them.
 """
@@ -19,20 +19,30 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.boundary import sampled
 from pathspace_graph.spline.bspline import BSpline
 
-from .constellation import APART, CURVE_STEP, FAILED, UNSEEN, Constellation, Known, Prior, SampledCurves
+from .constellation import (
+    CURVE_STEP,
+    FAILED,
+    PLACES_APART,
+    UNSEEN,
+    Constellation,
+    Known,
+    Prior,
+    SampledCurves,
+)
 
-SURE: Final = 7.0  # least log odds of a place where a wrong one costs the map: a thousand to one
+SURE_ODDS: Final = 7.0  # least log odds of a place where a wrong one costs the map: a thousand to one
 LEAST_CONES: Final = 6  # least number of cones in view at a place
-MOST_MISFIT: Final = 2.0  # largest mean capped square of these: the expectation of matching cones in 2D
-BY_CHANCE: Final = 0.6
+FIT_MISFIT: Final = 2.0  # largest mean capped square of these: the expectation of matching cones in 2D
+BEST_PLACES: Final = 3  # largest number of places returned
+FITS_BY_CHANCE: Final = 0.55
 """Probability that a cone lies on some other by chance, at a wrong place where its neighbours do."""
 
-WAY_STEP: Final = 2.0  # step of the points of a way (m)
+ROAD_STEP: Final = 2.0  # step of the points of a way (m)
 LEAD: Final = 4.0  # distance ahead of the vehicle of an additional point of its path (m)
 MISFIT_OF_WAY: Final = 3.0  # largest rms distance of an aligned path from the way (m)
 HYPOTHESES_APART: Final = 6.0  # least distance of hypotheses along the way (m)
 AT_HYPOTHESIS: Final = (3.0, 3.0, 0.2), (6.0, 0.2)  # sigmas and reach of the pose about one (m, m, rad)
-MOST_HYPOTHESES: Final = 24  # largest number of hypotheses, those of the best shape
+MOST_HYPOTHESES: Final = 16  # largest number of hypotheses, those of the best shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +55,7 @@ class Place:
 
 
 def find(seen: Constellation, known: Known, prior: Prior) -> list[Place]:
-    """Find the places where cones or lines, seen in the vehicle frame, lie on known ones; the best first.
+    """Find the best places where cones or lines, seen in the vehicle frame, lie on known ones, in order.
 
     The cost of a place is the sum of capped squares of what lies in view of the known there, plus the squared
     Mahalanobis distance from the prior, up to `FAILED`. What is out of view costs as much as at the next best
@@ -61,23 +71,25 @@ def find(seen: Constellation, known: Known, prior: Prior) -> list[Place]:
     unseen = _best_of_others(np.where(enough, misfit, inf), fits.poses, UNSEEN)
     out_of_view = unseen * (total - fits.counts)
     costs = fits.squares + out_of_view + np.minimum(fits.away, FAILED)
-    by_chance = 2.0 * log(1.0 / BY_CHANCE) * fits.counts - 2.0 * log(len(prior.poses))
+    by_chance = 2.0 * log(1.0 / FITS_BY_CHANCE) * fits.counts - 2.0 * log(len(prior.poses))
     none = fits.squares + out_of_view + prior.failed + by_chance
     order, places = np.argsort(costs, kind="stable"), list[Place]()
     for i in order.tolist():
         pose = fits.poses[i]
-        if any(np.hypot(*(pose - other.pose)[:2]) <= APART for other in places):
+        if len(places) == BEST_PLACES:
+            break
+        if any(np.hypot(*(pose - other.pose)[:2]) <= PLACES_APART for other in places):
             continue
-        others = np.hypot(*(fits.poses - pose)[:, :2].T) > APART
+        others = np.hypot(*(fits.poses - pose)[:, :2].T) > PLACES_APART
         rival = min(float(costs[others].min(initial=inf)), float(none[i]))
-        is_fit = enough[i] and misfit[i] <= MOST_MISFIT
+        is_fit = enough[i] and misfit[i] <= FIT_MISFIT
         places.append(Place(pose, fits.information[i], 0.5 * (rival - float(costs[i])) if is_fit else -inf))
     return places
 
 
 def _best_of_others(values: Array, poses: Array, limit: float) -> float:
     """Return the least value at another place than that of the least, up to a limit."""
-    others = np.hypot(*(poses - poses[int(values.argmin())])[:, :2].T) > APART
+    others = np.hypot(*(poses - poses[int(values.argmin())])[:, :2].T) > PLACES_APART
     return float(values[others].min(initial=limit))
 
 
@@ -91,12 +103,12 @@ def along(poses: Array, way: Array, is_closed: bool) -> Array:
     way, whose points are `WAY_STEP` apart. The best shape is first.
     """
     length = path_lengths(poses)
-    back = np.arange(min(length[-1], WAY_STEP * (len(way) - 1) - LEAD), 0.0, -WAY_STEP)[: len(way) - 3]
+    back = np.arange(min(length[-1], ROAD_STEP * (len(way) - 1) - LEAD), 0.0, -ROAD_STEP)[: len(way) - 3]
     at = length[-1] - np.append(back, 0.0)
     points = np.column_stack([np.interp(at, length, axis) for axis in poses[:, :2].T])
     lead = poses[-1, :2] + LEAD * np.array([np.cos(poses[-1, 2]), np.sin(poses[-1, 2])])
     path = np.concatenate([points, lead[None]]) @ np.array([1.0, 1j])
-    offsets = np.rint((np.append(at, length[-1] + LEAD) - length[-1]) / WAY_STEP).astype(np.intp)
+    offsets = np.rint((np.append(at, length[-1] + LEAD) - length[-1]) / ROAD_STEP).astype(np.intp)
     ends, around = np.arange(len(way)), way @ np.array([1.0, 1j])
     if not is_closed:
         ends = ends[(ends + offsets[0] >= 0) & (ends + offsets[-1] < len(way))]
@@ -118,7 +130,7 @@ def _spread(ends: IntArray, around: int | None, order: list[int]) -> list[int]:
         away = np.abs(taken - end)
         if around is not None:
             away = np.minimum(away, around - away)
-        if (away * WAY_STEP >= HYPOTHESES_APART).all():
+        if (away * ROAD_STEP >= HYPOTHESES_APART).all():
             chosen.append(i)
             taken = np.append(taken, end)
         if len(chosen) == MOST_HYPOTHESES:
@@ -138,7 +150,7 @@ class KnownRoad:
     def of(cls, splines: Mapping[int, BSpline], cones: Mapping[int, Array] | None = None) -> Self:
         """Lay out both curves of a map by label, and their cones (k, 2), parameters and sigmas (m).
 
-        Cones count only if both curves have some.
+        ConeArrays count only if both curves have some.
         """
         seen: Known = SampledCurves.of(splines)
         if cones and all(len(cones.get(label, ())) for label in splines):
@@ -149,7 +161,7 @@ class KnownRoad:
         first, other = (sampled(spline, CURVE_STEP) for spline in splines.values())
         middle = 0.5 * (first + other[KDTree(other).query(first)[1]])
         length = path_lengths(middle)
-        at = np.linspace(0.0, length[-1], max(round(length[-1] / WAY_STEP), 1) + 1)
+        at = np.linspace(0.0, length[-1], max(round(length[-1] / ROAD_STEP), 1) + 1)
         way = np.column_stack([np.interp(at, length, axis) for axis in middle.T])
         closed = all(spline.periodic for spline in splines.values())
         return cls(seen, way[:-1] if closed else way, closed)

@@ -22,9 +22,9 @@ from pathspace_graph.mapping.path import HEADING
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .constellation import Constellation, Prior, SampledCurves
-from .find import SURE, Place, find
+from .find import SURE_ODDS, Place, find
 
-NEWEST: Final = 30.0  # length of the newest path whose cones are laid on earlier ones (m)
+NEWEST_PATH: Final = 30.0  # length of the newest path whose cones are laid on earlier ones (m)
 BEYOND: Final = 10.0  # length by which the earlier path exceeds the newest on each side (m)
 NEARBY: Final = (1.0, 1.0, 0.05), (4.0, 0.15)
 """Sigmas (m, m, rad) and reach (m, rad) after laps were aligned, or beside another pass of an open road."""
@@ -112,16 +112,16 @@ def newest_place(
 ) -> Place | None:
     """Return the sure place of the newest cones on those around a cycle, or of lines on curves."""
     stations = path_lengths(poses)
-    first = int(stations.searchsorted(stations[-1] - NEWEST, side="right"))
+    first = int(stations.searchsorted(stations[-1] - NEWEST_PATH, side="right"))
     newest = np.arange(first, len(poses))
     growth, of_lines = settings.growth, settings.of_lines
     seen = Constellation.of(seen_in(newest), poses, growth, of_lines=of_lines).seen_from(poses[-1])
     if curves is None:
-        old = np.flatnonzero(np.abs(stations[:first] - stations[nearest]) < NEWEST + BEYOND)
+        old = np.flatnonzero(np.abs(stations[:first] - stations[nearest]) < NEWEST_PATH + BEYOND)
         places = find(seen, Constellation.of(seen_in(old), poses, growth), prior)
     else:
         places = find(seen, curves, tried_along(poses[:first], prior))
-    return places[0] if places and places[0].odds >= SURE else None
+    return places[0] if places and places[0].odds >= SURE_ODDS else None
 
 
 def tried_along(poses: Array, prior: Prior) -> Prior:

@@ -14,13 +14,10 @@ from pathspace_graph.batch.lap import OpenLap, along_of, lap_optimum, marginal_o
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.optimizer import predicted_decrease
 from pathspace_graph.batch.simplification import map_block, simplified
-from pathspace_graph.batch.stations import SHIFT_BLOCK, SeenAgain, laps_of, match_stations, shifts
+from pathspace_graph.batch.stations import laps_of, match_stations
 from pathspace_graph.batch.system import SIGMA_SLIDE, BatchSystem, Evaluation, moved
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.graph.drives import Drives
 from pathspace_graph.io.log import Log
-from pathspace_graph.labels import LEFT
-from pathspace_graph.mapping.stations import CurveStations
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import straight
@@ -29,66 +26,6 @@ from .test_lap import open_lap
 from .test_nonlinear_graph import rotations
 
 Array = NDArray[np.float64]
-
-LENGTH = 120.0
-JITTER = 0.6
-"""Standard deviation of a cone's place in a row that isn't regular (m)."""
-
-
-def row(gap: float, jitter: float) -> CurveStations:
-    """Return the stations of a closed curve of 120 m, some gap apart."""
-    u = np.arange(0.5 * gap, LENGTH, gap)
-    u = u + jitter * np.random.default_rng(2).normal(size=len(u))
-    return CurveStations.of(LEFT, 0, u, np.full(len(u), 0.02), (0.0, LENGTH))
-
-
-def seen_again(curve: CurveStations, off: float) -> SeenAgain:
-    """Return five detections of each cone in a second lap, with foot points `off` (m) along the curve."""
-    rng = np.random.default_rng(5)
-    u = np.repeat(curve.u, 5) - off + 0.05 * rng.normal(size=5 * len(curve.u))
-    block = ((LENGTH + u) // SHIFT_BLOCK).astype(np.intp)
-    return SeenAgain(curve, np.arange(len(u)), u, np.full(len(u), 0.1), block)
-
-
-@pytest.mark.parametrize("off", [0.0, 1.3, -1.7, 2.9])
-def test_a_later_lap_is_shifted_to_its_cones(off: float) -> None:
-    """The blocks of the first lap have nothing to shift."""
-    found = shifts([seen_again(row(3.0, JITTER), off)])[int(LENGTH / SHIFT_BLOCK) :]
-    np.testing.assert_allclose(found, off, atol=0.11)
-
-
-def test_a_shift_that_may_be_another_is_in_doubt() -> None:
-    """In a row of gaps of 3 m half a gap ahead is half a gap behind; a whole one is too much to believe."""
-    regular = row(3.0, 0.0)
-    half, none = (shifts([seen_again(regular, off)])[int(LENGTH / SHIFT_BLOCK) :] for off in (1.5, 0.0))
-    assert np.isnan(half).all()
-    np.testing.assert_allclose(none, 0.0, atol=0.11)
-
-
-def test_both_boundaries_tell_the_shift_together() -> None:
-    """Each of two regular rows would be in doubt, but not both."""
-    rows = [seen_again(row(gap, 0.0), 1.4) for gap in (2.5, 3.0)]
-    assert np.isnan(shifts(rows[:1])[int(LENGTH / SHIFT_BLOCK) :]).all()
-    np.testing.assert_allclose(shifts(rows)[int(LENGTH / SHIFT_BLOCK) :], 1.4, atol=0.11)
-
-
-def test_a_cone_counts_once_however_often_it_is_seen() -> None:
-    """One that was moved by 1.2 m since the first lap, and is seen a thousand times, shifts nothing."""
-    curve = row(3.0, JITTER)
-    seen = seen_again(curve, 0.0)
-    at = len(seen.rows) // 2
-    u, block = (
-        np.append(seen.u, np.full(1000, seen.u[at] - 1.2)),
-        np.append(seen.block, [seen.block[at]] * 1000),
-    )
-    many = SeenAgain(curve, np.arange(len(u)), u, np.full(len(u), 0.1), block)
-    np.testing.assert_allclose(shifts([many])[int(LENGTH / SHIFT_BLOCK) :], 0.0, atol=0.11)
-
-
-def test_nothing_seen_again_has_no_shift() -> None:
-    first = seen_again(row(3.0, JITTER), 0.0)
-    assert len(shifts([replace(first, block=np.full(len(first.rows), -1))])) == 0
-
 
 # --- a drive ---------------------------------------------------------------------------------------------
 
@@ -133,20 +70,6 @@ def test_detections_of_both_passes_are_of_one_cone(off: float) -> None:
     cone = true_cones(system, found.rows)
     for station in np.unique(found.station):
         assert len(np.unique(cone[found.station == station])) == 1
-
-
-def test_no_stretch_of_one_drive_is_next_to_one_of_another() -> None:
-    """The end of one drive says nothing of the shift at the beginning of the next."""
-    system, at, _ = optimum()
-    state, detections = at.state.copy(), system.detections
-    label, cut = LEFT, len(at.state.poses) - 10
-    curve = CurveStations.of(label, 0, np.arange(5.0), np.full(5, 0.02), (0.0, LENGTH))
-    state.drives = Drives((0, cut), (0, 0))
-    seen = SeenAgain.of(state, detections, curve)
-    is_second = detections.cycle[seen.rows] >= cut
-    again = seen.block >= 0
-    first, second = seen.block[again & ~is_second], seen.block[again & is_second]
-    assert second.min() >= first.max() + 3
 
 
 def test_the_gradient_is_that_of_the_cost() -> None:

@@ -8,15 +8,15 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import left_of, rotation, wrap_angle
-from pathspace_graph.places.constellation import Cones
+from pathspace_graph.places.constellation import ConeArrays
 
 GATES: Final = (4.0, 4.0, 2.0, 1.0, 1.0, 1.0)  # factors of the cap in the steps of the refinement
 REGULAR: Final = (1e-2, 1e-2, 1.0)  # information added in a step, so that few cones still give one
 
 
 def laid(
-    seen: Cones,
-    known: Cones,
+    seen: ConeArrays,
+    known: ConeArrays,
     views: Array,
     means: Array,
     prior: Array,
@@ -45,8 +45,8 @@ def laid(
 
 
 def _starts(
-    seen: Cones,
-    known: Cones,
+    seen: ConeArrays,
+    known: ConeArrays,
     mean: Array,
     prior: Array,
     reach: tuple[float, float],
@@ -82,8 +82,8 @@ def _starts(
 
 
 def _refined(
-    seen: Cones,
-    known: Cones,
+    seen: ConeArrays,
+    known: ConeArrays,
     views: Array,
     start: Array,
     mean: Array,

@@ -11,10 +11,11 @@ from pathspace_graph.factors.se2 import compose, inverse, path_lengths
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.places.constellation import CURVE_SIGMA, LINE_WEIGHT, Constellation, Prior, SampledCurves
 from pathspace_graph.places.find import (
+    FITS_BY_CHANCE,
     HYPOTHESES_APART,
     LEAST_CONES,
-    SURE,
-    WAY_STEP,
+    ROAD_STEP,
+    SURE_ODDS,
     KnownRoad,
     along,
     find,
@@ -75,7 +76,7 @@ def test_a_vehicle_is_found_anywhere(begin: float, has_cones: bool) -> None:
     poses = driven(PEAR, begin, begin + 2.4)
     known = road(PEAR, has_cones)
     place = find(seen_from(PEAR, poses), known.seen, known.along(compose(inverse(MOTION), poses)))[0]
-    assert place.odds >= SURE
+    assert place.odds >= SURE_ODDS
     np.testing.assert_allclose(place.pose[:2], poses[-1, :2], atol=0.05)
     np.testing.assert_allclose(np.sin(place.pose[2] - poses[-1, 2]), 0.0, atol=0.01)
 
@@ -86,7 +87,7 @@ def test_on_another_road_it_is_nowhere(has_cones: bool) -> None:
     for begin in np.arange(0.0, 6.0, 0.5):
         poses = driven(PEAR, begin, begin + 2.4)
         places = find(seen_from(PEAR, poses), known.seen, known.along(poses))
-        assert not places or places[0].odds < SURE
+        assert not places or places[0].odds < SURE_ODDS
 
 
 @pytest.mark.parametrize("has_cones", [True, False])
@@ -99,13 +100,27 @@ def test_of_two_places_that_look_alike_none_is_sure(has_cones: bool) -> None:
     np.testing.assert_allclose(places[1].pose[:2], -places[0].pose[:2], atol=0.2)
 
 
+def test_the_more_places_are_tried_the_more_fit_by_chance() -> None:
+    """Nine more hypotheses, at which no cone is in reach, cost the odds ln(10)."""
+    poses = driven(PEAR, 1.0, 3.4)
+    known, seen = road(PEAR, True), seen_from(PEAR, poses)
+    few = Constellation(*(column[:8] for column in seen.cones))
+    elsewhere = poses[-1] + np.column_stack([500.0 * np.arange(10), np.zeros((10, 2))])
+    odds = [
+        find(few, known.seen, Prior.about(tried, (3.0, 3.0, 0.2), (1.0, 0.1), failed=0.0))[0].odds
+        for tried in (poses[-1], elsewhere)
+    ]
+    assert odds[0] == pytest.approx(8.0 * np.log(1.0 / FITS_BY_CHANCE), abs=0.01)
+    assert odds[0] - odds[1] == pytest.approx(np.log(10.0), abs=0.01)
+
+
 def test_backwards_left_is_right() -> None:
     poses = driven(PEAR, 1.0, 3.4)
     seen, own = seen_from(PEAR, poses), compose(inverse(MOTION), poses)
     turned = road(PEAR, True).backwards()
-    assert all(place.odds < SURE for place in find(seen, turned.seen, turned.along(own)))
+    assert all(place.odds < SURE_ODDS for place in find(seen, turned.seen, turned.along(own)))
     forwards = turned.backwards()
-    assert find(seen, forwards.seen, forwards.along(own))[0].odds >= SURE
+    assert find(seen, forwards.seen, forwards.along(own))[0].odds >= SURE_ODDS
 
 
 # --- hypotheses --------------------------------------------------------------------------------------------
@@ -114,7 +129,7 @@ def test_backwards_left_is_right() -> None:
 def test_a_path_is_laid_where_it_belongs() -> None:
     """A part of a loop is found at its place, the best first, and the others are apart."""
     way = road(PEAR, False).way
-    assert np.abs(np.diff(path_lengths(way)) - WAY_STEP).max() < 0.1
+    assert np.abs(np.diff(path_lengths(way)) - ROAD_STEP).max() < 0.1
     poses = driven(PEAR, 4.0, 7.0)
     found = along(compose(inverse(MOTION), poses), way, True)
     np.testing.assert_allclose(found[0][:2], poses[-1, :2], atol=1.0)

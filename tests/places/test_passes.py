@@ -17,15 +17,15 @@ from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.tentative import TentativeTracks, merged_in_turn
 from pathspace_graph.places.constellation import (
+    CONE_SIGHTINGS,
     FAILED,
     FIT_SIGMA,
-    RANGE,
-    SIGHTINGS,
+    MERGE_RANGE,
     VIEWS,
     Constellation,
     Prior,
 )
-from pathspace_graph.places.find import BY_CHANCE, LEAST_CONES, SURE, Place, find
+from pathspace_graph.places.find import FITS_BY_CHANCE, LEAST_CONES, SURE_ODDS, Place, find
 from pathspace_graph.places.passes import (
     NEARBY,
     SeenIn,
@@ -80,7 +80,7 @@ def best(
 
 
 def is_sure(place: Place) -> bool:
-    return place.odds >= SURE
+    return place.odds >= SURE_ODDS
 
 
 # --- the pose --------------------------------------------------------------------------------------------
@@ -104,7 +104,7 @@ def test_a_cone_lies_on_one_of_its_own_colour_only() -> None:
     assert not is_sure(best(other, known, POSE, NOTHING, REACH))
 
 
-NOWHERE = FAILED + 20 * 2.0 * log(1.0 / BY_CHANCE)
+NOWHERE = FAILED + 20 * 2.0 * log(1.0 / FITS_BY_CHANCE)
 """Cost of twenty cones at none of the places, after odometry has failed: less than in any wrong place."""
 
 
@@ -139,7 +139,7 @@ def test_the_heading_may_have_turned_around() -> None:
 def test_the_information_is_that_of_repeated_observations() -> None:
     """Errors of samples have the claimed covariance, but for the efficiency that the cap of squares costs.
 
-    Cones whose errors are those of their covariances alone tell more than is claimed.
+    ConeArrays whose errors are those of their covariances alone tell more than is claimed.
     """
     rng, known = np.random.default_rng(3), scattered(16)
     variances = FIT_SIGMA**2 + 2.0 * COVARIANCE, 2.0 * COVARIANCE
@@ -190,7 +190,7 @@ def test_most_cones_must_lie_on_earlier_ones(gone: int, fits: bool) -> None:
     known = scattered()
     moved = known.points + np.where(np.arange(20) < gone, 50.0, 0.0)[:, None]
     place = best(replace(known, points=moved).seen_from(POSE), known, POSE, NOTHING, REACH)
-    assert (place.odds >= SURE) is fits
+    assert (place.odds >= SURE_ODDS) is fits
 
 
 @pytest.mark.parametrize(("sigmas", "fits"), [(1.35, True), (1.5, False)])
@@ -200,7 +200,7 @@ def test_cones_that_lie_beside_others_do_not_agree(sigmas: float, fits: bool) ->
     off = sigmas * np.sqrt(FIT_SIGMA**2 + 2.0 * COVARIANCE) * np.where(np.arange(16) % 4 % 3, 1.0, -1.0)
     moved = points + np.column_stack([off, np.zeros(16)])
     place = best(constellation(moved).seen_from(POSE), constellation(points), POSE, NOTHING, (0.4, 0.01))
-    assert (place.odds >= SURE) is fits
+    assert (place.odds >= SURE_ODDS) is fits
 
 
 @pytest.mark.parametrize(
@@ -276,14 +276,14 @@ def test_detections_are_merged_in_turn_as_tracks_are() -> None:
 
 def test_cones_are_seen_often_enough_near_enough_and_in_colour() -> None:
     """Each of four cones but the first lacks one of these."""
-    near, far = [5.0, 1.0], [RANGE + 1.0, 0.0]
-    rows = [(near, LEFT)] * SIGHTINGS + [([5.0, -3.0], LEFT)] * (SIGHTINGS - 1)
-    rows += [(far, LEFT)] * SIGHTINGS + [([1.0, 4.0], UNKNOWN)] * SIGHTINGS
+    near, far = [5.0, 1.0], [MERGE_RANGE + 1.0, 0.0]
+    rows = [(near, LEFT)] * CONE_SIGHTINGS + [([5.0, -3.0], LEFT)] * (CONE_SIGHTINGS - 1)
+    rows += [(far, LEFT)] * CONE_SIGHTINGS + [([1.0, 4.0], UNKNOWN)] * CONE_SIGHTINGS
     points, labels = np.array([point for point, _ in rows]), np.array([label for _, label in rows])
     seen = Detections(0.0, points, np.tile(0.03 * np.eye(2), (len(rows), 1, 1)), labels)
     found = Constellation.of(DetectionColumns.of([seen]), POSE[None], GROWTH)
     np.testing.assert_allclose(found.points, to_map(np.array([near]), POSE[None]))
-    np.testing.assert_allclose(found.covariances, [0.03 / SIGHTINGS * np.eye(2)], atol=1e-12)
+    np.testing.assert_allclose(found.covariances, [0.03 / CONE_SIGHTINGS * np.eye(2)], atol=1e-12)
     np.testing.assert_array_equal(found.labels, [LEFT])
 
 
@@ -320,7 +320,7 @@ def sensor(poses: Array, seed: int = 0) -> SeenIn:
         seen = []
         for k in cycles.tolist():
             points = to_vehicle(cones, poses[k : k + 1])
-            near = np.hypot(*points.T) < RANGE - 1.0
+            near = np.hypot(*points.T) < MERGE_RANGE - 1.0
             covariances = np.tile(0.02 * np.eye(2), (near.sum(), 1, 1))
             seen.append(Detections(0.0, points[near], covariances, np.flatnonzero(near) % 2))
         table = DetectionColumns.of(seen)
@@ -381,7 +381,7 @@ def test_another_road_beside_is_no_return(lane: float, is_same: bool) -> None:
 
 def test_a_pose_before_the_newest_moves_with_it() -> None:
     true = along(LAP, (20.0, 1.0 / 12.0))
-    laid = Place(true[-1], np.eye(3), SURE)
+    laid = Place(true[-1], np.eye(3), SURE_ODDS)
     revisit = revisit_of(laid, true, 8, len(true) - 11)
     np.testing.assert_allclose(revisit.local, relative(true[8], true[-11]), atol=1e-9)
     assert (revisit.earlier, revisit.later) == (8, len(true) - 11)
@@ -393,7 +393,7 @@ def test_the_information_moves_with_the_pose() -> None:
     frame, later, newest = np.array([[4.0, 1.0, 0.7], [1.0, -1.0, 1.7], [7.0, -3.0, 2.1]])
     spread = rng.normal(size=(3, 3)) * np.array([[1e-2], [1e-2], [1e-3]])
     covariance = spread @ spread.T
-    place = Place(newest, np.linalg.inv(covariance), SURE)
+    place = Place(newest, np.linalg.inv(covariance), SURE_ODDS)
     revisit = revisit_of(place, np.array([frame, later, newest]), 0, 1)
     np.testing.assert_allclose(revisit.local, relative(frame, later))
     samples = rng.multivariate_normal(np.zeros(3), covariance, 20_000)
