@@ -1,6 +1,6 @@
 """Find the place of a vehicle on what is known, by hypotheses, fits and odds.
 
-A prior or the shape of the driven path proposes poses, and cones or curves verify them. ConeArrays stand at
+A prior or the shape of the driven path proposes poses, and cones or curves verify them. Cones stand at
 regular distances, so a few of them fit in many places. A place has log odds against every rival: the other
 places, and that the vehicle is at none of them.
 """
@@ -38,7 +38,7 @@ FITS_BY_CHANCE: Final = 0.55
 """Probability that a cone lies on some other by chance, at a wrong place where its neighbours do."""
 
 ROAD_STEP: Final = 2.0  # step of the points of a way (m)
-LEAD: Final = 4.0  # distance ahead of the vehicle of an additional point of its path (m)
+STEPS_AHEAD: Final = 2  # number of points straight ahead of the vehicle that are aligned with the way, too
 MISFIT_OF_WAY: Final = 3.0  # largest rms distance of an aligned path from the way (m)
 HYPOTHESES_APART: Final = 6.0  # least distance of hypotheses along the way (m)
 AT_HYPOTHESIS: Final = (3.0, 3.0, 0.2), (6.0, 0.2)  # sigmas and reach of the pose about one (m, m, rad)
@@ -99,19 +99,17 @@ def _best_of_others(values: Array, poses: Array, limit: float) -> float:
 def along(poses: Array, way: Array, is_closed: bool) -> Array:
     """Return the poses (k, 3) that the newest of poses (P, 3) has where the path aligns with a way (n, 2).
 
-    The path, with a point ahead of the vehicle, is aligned rigidly (Umeyama 1991) with each stretch of the
-    way, whose points are `WAY_STEP` apart. The best shape is first.
+    The path, continued straight ahead, is aligned rigidly (Umeyama 1991) with each stretch of the way, whose
+    points are `ROAD_STEP` apart. The best shape is first.
     """
     length = path_lengths(poses)
-    back = np.arange(min(length[-1], ROAD_STEP * (len(way) - 1) - LEAD), 0.0, -ROAD_STEP)[: len(way) - 3]
-    at = length[-1] - np.append(back, 0.0)
-    points = np.column_stack([np.interp(at, length, axis) for axis in poses[:, :2].T])
-    lead = poses[-1, :2] + LEAD * np.array([np.cos(poses[-1, 2]), np.sin(poses[-1, 2])])
-    path = np.concatenate([points, lead[None]]) @ np.array([1.0, 1j])
-    offsets = np.rint((np.append(at, length[-1] + LEAD) - length[-1]) / ROAD_STEP).astype(np.intp)
+    offsets = np.arange(-min(int(length[-1] / ROAD_STEP), len(way) - 1 - STEPS_AHEAD), STEPS_AHEAD + 1)
+    at = length[-1] + ROAD_STEP * offsets
+    x, y = (np.interp(at, length, axis) for axis in poses[:, :2].T)
+    path = x + 1j * y + np.maximum(ROAD_STEP * offsets, 0.0) * np.exp(1j * poses[-1, 2])
     ends, around = np.arange(len(way)), way @ np.array([1.0, 1j])
     if not is_closed:
-        ends = ends[(ends + offsets[0] >= 0) & (ends + offsets[-1] < len(way))]
+        ends = ends[-offsets[0] : len(way) - STEPS_AHEAD]
     target = around[(ends[:, None] + offsets) % len(way)]
     mean, means = path.mean(), target.mean(axis=1)
     turn = ((path - mean).conj() * (target - means[:, None])).sum(axis=1)
@@ -143,14 +141,14 @@ class KnownRoad:
     """A known road: what is seen on it, and the way along it."""
 
     seen: Known  # its cones, or its curves where it has none
-    way: Array  # (n, 2) points of its middle in driving order, `WAY_STEP` apart
+    way: Array  # (n, 2) points of its middle in driving order, `ROAD_STEP` apart
     closed: bool
 
     @classmethod
     def of(cls, splines: Mapping[int, BSpline], cones: Mapping[int, Array] | None = None) -> Self:
         """Lay out both curves of a map by label, and their cones (k, 2), parameters and sigmas (m).
 
-        ConeArrays count only if both curves have some.
+        Cones count only if both curves have some.
         """
         seen: Known = SampledCurves.of(splines)
         if cones and all(len(cones.get(label, ())) for label in splines):
