@@ -71,7 +71,8 @@ def find(seen: Constellation, known: Known, prior: Prior) -> list[Place]:
     unseen = _best_of_others(np.where(enough, misfit, inf), fits.poses, UNSEEN)
     out_of_view = unseen * (total - fits.counts)
     costs = fits.squares + out_of_view + np.minimum(fits.away, FAILED)
-    by_chance = 2.0 * log(1.0 / FITS_BY_CHANCE) * fits.counts - 2.0 * log(len(prior.poses))
+    by_cone = np.minimum(2.0 * log(1.0 / FITS_BY_CHANCE), FIT_MISFIT - misfit)
+    by_chance = by_cone * fits.counts - 2.0 * log(len(prior.poses))
     none = fits.squares + out_of_view + prior.failed + by_chance
     order, places = np.argsort(costs, kind="stable"), list[Place]()
     for i in order.tolist():
