@@ -20,12 +20,8 @@ TOLERANCE = 1e-12
 
 def to_scipy(spline: BSpline) -> scipy.interpolate.BSpline:
     """Scipy's class for the same curve."""
-    return scipy.interpolate.BSpline(
-        spline.knots,
-        spline.control_points,
-        spline.degree,
-        extrapolate="periodic" if spline.periodic else False,
-    )
+    beyond = "periodic" if spline.periodic else False
+    return scipy.interpolate.BSpline(spline.knots, spline.control_points, spline.degree, extrapolate=beyond)
 
 
 def wandering(rng: np.random.Generator, n: int) -> Array:
