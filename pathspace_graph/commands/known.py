@@ -8,7 +8,7 @@ import numpy as np
 
 from pathspace_graph.batch.known_map import map_of_cones
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.metrics.differences import MapDifference, differences
+from pathspace_graph.eval.metrics.alignment import MapDifference, differences
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.results import RunResult
