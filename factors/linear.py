@@ -1,4 +1,4 @@
-"""GTSAM's linear factors from arrays and back, without loss of a bit."""
+"""GTSAM's linear factors from arrays, without loss of a bit."""
 
 import gtsam
 import numpy as np
@@ -25,10 +25,3 @@ def linear_factor(keys: IntArray, widths: IntArray, A: Array, b: Array) -> gtsam
 def keys_of_factor(factor: gtsam.GaussianFactor | gtsam.NonlinearFactor) -> IntArray:
     """Return the keys (k,) of a factor in its own order."""
     return np.array(list(factor.keys()), np.intp)
-
-
-def jacobian_matrix(factor: gtsam.JacobianFactor) -> Array:
-    """Return `[A b]` (m, n + 1) of a factor or a conditional; ValueError where it has a noise model."""
-    if factor.get_model() is not None:
-        raise ValueError(f"expected whitened rows, found a {type(factor.get_model()).__name__} noise model")
-    return np.array(factor.augmentedJacobian(), np.float64, order="F")

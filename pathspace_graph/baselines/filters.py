@@ -26,7 +26,7 @@ from pathspace_graph.spline.knots import refit
 
 from .ckf_curves import CurveState, Expansion, in_map
 from .ckf_update import OnCurve, classify, update
-from .landmark_association import ROUGH_GATE, associate, compatible, pair_costs
+from .landmark_association import ROUGH_GATE, assign, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 from .online import FRONT_END, OnlineBaseline
 from .periodic import JOIN_MARGIN, JOIN_SHARE, OVERLAP_STEP, make_periodic
@@ -238,7 +238,7 @@ class LandmarkCkf(_Filter):
             covariances = seen.covariance.reshape(k, POINT, k, POINT)[np.arange(k), :, np.arange(k)]
         cost = pair_costs(detections.points_vehicle, detections.covariances, predicted, covariances)
         cost[~compatible(detections.labels, self.labels[nearby])] = np.inf
-        column, is_new = associate(cost)
+        column, is_new = assign(cost)
         matched = column != UNASSOCIATED
         landmark = np.full(len(detections.labels), UNASSOCIATED, np.intp)
         landmark[matched] = nearby[column[matched]]

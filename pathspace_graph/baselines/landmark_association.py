@@ -26,7 +26,7 @@ MATCH_GATE: Final = chi2_quantile(MATCH, POINT)  # gate of a match (squared Maha
 CREATE_GATE: Final = chi2_quantile(CREATE, POINT)  # gate outside of which a detection may be new
 
 
-def associate(cost: Array) -> tuple[IntArray, BoolArray]:
+def assign(cost: Array) -> tuple[IntArray, BoolArray]:
     """Minimize `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
 
     cost (m, n) are squared Mahalanobis distances of detections to landmarks, infinite for other labels.
@@ -78,10 +78,10 @@ def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray
     near = nearest_within(state.landmarks, points, ROUGH_GATE)[1]
     landmarks = np.flatnonzero(near & eligible)
     numbers = state.numbers[landmarks]
-    predicted = predict(smoother, landmarks)
+    predicted = predicted_points(smoother, landmarks)
     any_label = pair_costs(detections.point[rows], detections.covariance[rows], *predicted)
     same_label = compatible(detections.label[rows], state.labels[landmarks])
-    landmark, is_new = associate(np.where(same_label, any_label, np.inf))
+    landmark, is_new = assign(np.where(same_label, any_label, np.inf))
     matched = landmark != UNASSOCIATED
     detections.take(rows[matched], numbers[landmark[matched]])
     explained = (any_label < MATCH_GATE).any(axis=1)
@@ -90,7 +90,7 @@ def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray
         state.vote(detections.label[rows[explained]], numbers[any_label[explained].argmin(axis=1)])
 
 
-def predict(smoother: LandmarkSmoother, landmarks: IntArray) -> tuple[Array, Array]:
+def predicted_points(smoother: LandmarkSmoother, landmarks: IntArray) -> tuple[Array, Array]:
     """Predict detections of landmarks (k,), by position, from the newest pose.
 
     They (k, 2) are in m, vehicle frame, with covariances `H_j Sigma H_j'` (k, 2, 2). Sigma is the covariance

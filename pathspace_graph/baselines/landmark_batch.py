@@ -60,7 +60,7 @@ class LandmarkBatch:
 
     def _solve(self, log: Log) -> BatchRun:
         noise = known_noise(self.odometry_sigma)
-        system, state = start_online(log, LandmarkSystem.of_log(log, self.settings, noise), noise)
+        system, state = start_landmarks(log, LandmarkSystem.of_log(log, self.settings, noise), noise)
         system.optimize(state)
         for _ in range(MAX_ROUNDS):
             converged = self._refresh(system, state) <= SETTLED_SHARE * len(system.detections)
@@ -145,7 +145,9 @@ class LandmarkSystem:
         self.detections.correct(variables.sensor)
 
 
-def start_online(log: Log, system: LandmarkSystem, noise: KnownNoise) -> tuple[LandmarkSystem, LandmarkState]:
+def start_landmarks(
+    log: Log, system: LandmarkSystem, noise: KnownNoise
+) -> tuple[LandmarkSystem, LandmarkState]:
     """Return the last map of the online run, with each pose and association as of its end in the window."""
     online = LandmarkFixedLag(system.settings, noise)
     detections, smoother, track = system.detections, online.smoother, online.smoother.map
@@ -203,7 +205,7 @@ class Reassociation:
         table[i, j] = cost
         same_label = association.compatible(self.detections.label[detected], self.state.labels[candidates])
         table[~same_label] = np.inf
-        landmark, free[detected] = association.associate(table)
+        landmark, free[detected] = association.assign(table)
         matched = landmark != UNASSOCIATED
         self.detections.take(detected[matched], self.state.numbers[candidates[landmark[matched]]])
 

@@ -16,7 +16,7 @@ from pathspace_graph.convert.text_files import read_csv, read_json_lines
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError
 from pathspace_graph.front_end.front_end import seen_cycles
 from pathspace_graph.front_end.gate import check_usable
-from pathspace_graph.front_end.noise import measure
+from pathspace_graph.front_end.noise import measure_noise
 from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE, Log, Odometry
@@ -143,7 +143,7 @@ def with_measured_noise(log: Log, parts: int = 1) -> Log:
     at_one, samples = log.at_scale_one(), TwistRecord()
     samples.add(Odometry(at_one.odometry.t[::parts], at_one.odometry.twist[::parts]))
     cycles, _ = seen_cycles(at_one, settings)
-    measured = measure(cycles, samples, of_lines=settings.kind == "line")
+    measured = measure_noise(cycles, samples, of_lines=settings.kind == "line")
     if measured is None:
         return log
     white = measured.odometry * np.sqrt(parts)

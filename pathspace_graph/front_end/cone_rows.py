@@ -16,7 +16,7 @@ from pathspace_graph.mapping.path import along_and_across, crosses
 
 
 @dataclass(frozen=True)
-class Limits:
+class RowLimits:
     """Limits of a step from one cone of a row to the next; its cost is `distance (1 + turn_cost turn^2)`."""
 
     gap: float  # largest distance of neighbours (m)
@@ -26,9 +26,9 @@ class Limits:
     width: float  # least distance from the other row (m)
 
 
-EXTENDED: Final = Limits(gap=11.0, turn=2.0, turn_rate=0.1, turn_cost=1.0, width=1.5)
+EXTENDED: Final = RowLimits(gap=11.0, turn=2.0, turn_rate=0.1, turn_cost=1.0, width=1.5)
 """Limits of rows of known colours: two regular gaps, since one cone may be missed."""
-DEALT_OUT: Final = Limits(gap=8.0, turn=1.3, turn_rate=0.0, turn_cost=2.0, width=1.8)
+DEALT_OUT: Final = RowLimits(gap=8.0, turn=1.3, turn_rate=0.0, turn_cost=2.0, width=1.8)
 WIDTH_RATIO: Final = 1.8  # largest growth of the distance from the other row between successive cones
 WIDTH_SLACK: Final = 1.0  # additional growth allowed (m)
 CLEAR: Final = 1.3  # least ratio of a cone's cost in the other row to its cost in its own
@@ -66,7 +66,7 @@ class ConeRow:
         self.line = np.concatenate([self.line, self.candidates[index, None]])
         self.chosen.append(index)
 
-    def costs(self, indices: IntArray, limits: Limits) -> tuple[Array, Array]:
+    def costs(self, indices: IntArray, limits: RowLimits) -> tuple[Array, Array]:
         """Return distances (k,) in m and costs (k,) of candidates, infinite beyond the largest turn."""
         step = self.candidates[indices] - self.end
         distance, (cos, sin) = np.hypot(step[:, 0], step[:, 1]), self.direction

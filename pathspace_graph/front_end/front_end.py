@@ -20,9 +20,9 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .gate import Admitted, Gate
 from .line_matching import merged
 from .log_odometry import LogOdometry, chained
-from .measurement import odometry_of
+from .measurement import odometry_noise
 from .motion import MotionCheck
-from .noise import NoiseLearner, measure
+from .noise import NoiseLearner, measure_noise
 from .sides import SideJudge
 from .sightings import SeenCycle, TwistRecord
 
@@ -174,7 +174,7 @@ def is_orange(detections: Detections) -> BoolArray:
 def measure_log(log: Log, settings: MapperSettings | None = None) -> MeasuredNoise | None:
     """Measure the noise of a whole log and the constant errors of its sensor from its readings alone."""
     settings = settings or MapperSettings()
-    return measure(*seen_cycles(log, settings), of_lines=settings.of_lines)
+    return measure_noise(*seen_cycles(log, settings), of_lines=settings.of_lines)
 
 
 def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[SeenCycle], TwistRecord]:
@@ -183,7 +183,7 @@ def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[
     readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
     for odometry, _ in readings:
         twists.add(odometry)
-    white = odometry_of(twists, None)
+    white = odometry_noise(twists, None)
     check, sides = (
         MotionCheck(
             log.noise.twist if white is None else white.twist, settings.motion, of_lines=settings.of_lines

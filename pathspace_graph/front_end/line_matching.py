@@ -61,7 +61,7 @@ class Seen(NamedTuple):
         return Seen(self.points[chosen], self.variances[chosen])
 
 
-class Limits(NamedTuple):
+class MatchLimits(NamedTuple):
     """Limits of a match, as `scan_matching` has them for cones."""
 
     farthest: float  # distance in reaches from which on a remembered detection has no weight
@@ -107,7 +107,7 @@ class LineMatch:
 
     recent: Array  # (k, 2) recent points (m)
     seen: Seen
-    limits: Limits
+    limits: MatchLimits
 
     def found(self, start: Array, reaches: Sequence[float]) -> tuple[Array, Array, BoolArray, float]:
         """Lay the detections on the recent points by Gauss-Newton steps from a pose (3,), one for each reach.

@@ -31,7 +31,7 @@ from .measurement import (
     Rays,
     clustered,
     line_through,
-    odometry_of,
+    odometry_noise,
     runs,
     with_detections,
 )
@@ -49,7 +49,7 @@ CLIPPED: Final = 9.0  # largest whitened square that counts for the noise
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class LineFit:
     """Parabolas through the points of each cell, and what is left of the points across them."""
 
     table: Sightings  # sorted by cell, then by time
@@ -65,7 +65,7 @@ class Fit:
     clustered: Array  # (7, 7) by how much the cells disagree
 
 
-def points_of(cycles: Sequence[SeenCycle]) -> Sightings:
+def sightings_of(cycles: Sequence[SeenCycle]) -> Sightings:
     """Points of lines that were seen in motion, in order of time, with their labels for cells."""
     t, twists = np.array([one.detections.t for one in cycles]), np.array([one.twist for one in cycles])
     poses = np.array([one.pose for one in cycles])
@@ -104,7 +104,7 @@ def _columns(table: Sightings, first: IntArray) -> Array:
     return kernels.by_constants(table.point, table.twist, table.pose, table.by_bias, first, BENDS_FROM)
 
 
-def fit(table: Sightings, errors: Array, noise: Rays, walk: Array) -> Fit | None:
+def fit(table: Sightings, errors: Array, noise: Rays, walk: Array) -> LineFit | None:
     """Return parabolas and constants by least squares; None where too few points tell them.
 
     The odometry walks (3,) by m, m and rad in the root of a second.
@@ -143,7 +143,7 @@ def fit(table: Sightings, errors: Array, noise: Rays, walk: Array) -> Fit | None
     leverage = weight * np.einsum("nk,nkl,nl->n", basis, inverse[cell], basis)
     middle = np.add.reduceat(table.t, begins) / counts
     spread = clustered(middle, scores, covariance)
-    return Fit(table, begins, counts, shares, ranges, drift, off, leverage, found, covariance, spread)
+    return LineFit(table, begins, counts, shares, ranges, drift, off, leverage, found, covariance, spread)
 
 
 def _drift(table: Sightings, ranges: Array, begins: IntArray, counts: IntArray, walk: Array) -> Array:
@@ -169,7 +169,7 @@ def _frames(points: Array, weight: Array, begins: IntArray, counts: IntArray) ->
     return tangents, (off * tangents).sum(axis=1), (off * left_of(tangents)).sum(axis=1)
 
 
-def noise_of(found: Fit, noise: Rays) -> Rays:
+def noise_of(found: LineFit, noise: Rays) -> Rays:
     """Return the noise along and across the ray by range, by what is left across the parabolas.
 
     Its expectation is `(1 - leverage) sum_k share_k (a_k^2 + b_k^2 r^2)`, which is linear in the squares.
@@ -193,7 +193,7 @@ class LineMeasurement:
 
     def __init__(self, cycles: Sequence[SeenCycle], found: MeasuredNoise) -> None:
         """Begin with the cycles of a drive, and with what is known: the noise of the odometry at least."""
-        self._found, self._points = found, points_of(cycles)
+        self._found, self._points = found, sightings_of(cycles)
         self._errors, self._rounds = np.zeros(len(PRIOR)), ROUNDS_FIRST
         self._noise: Rays = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
         if found.along is not None and found.across is not None:
@@ -203,7 +203,7 @@ class LineMeasurement:
     @classmethod
     def of(cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None) -> Self | None:
         """Return a measurement; None where not even the noise of the odometry can be told."""
-        found = odometry_of(twists, known)
+        found = odometry_noise(twists, known)
         return None if found is None else cls(cycles, found)
 
     def copy(self) -> Self:

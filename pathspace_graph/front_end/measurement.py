@@ -247,7 +247,7 @@ class Measurement(Copyable):
     @classmethod
     def of(cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None) -> Self | None:
         """Return a measurement, or None if not even the noise of the odometry can be estimated."""
-        found = odometry_of(twists, known)
+        found = odometry_noise(twists, known)
         return None if found is None else cls(cycles, found)
 
     def _begin(self, found: MeasuredNoise) -> None:
@@ -310,7 +310,7 @@ class Measurement(Copyable):
         return None if self._passes else found
 
 
-def odometry_of(twists: TwistRecord, known: MeasuredNoise | None) -> MeasuredNoise | None:
+def odometry_noise(twists: TwistRecord, known: MeasuredNoise | None) -> MeasuredNoise | None:
     """Return `known` with the measured noise of the odometry; None if there are too few twists."""
     white = twists.white()
     if white is None:

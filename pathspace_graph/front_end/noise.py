@@ -244,7 +244,7 @@ def begun(
     return (LineMeasurement if of_lines else Measurement).of(cycles, twists, known)
 
 
-def measure(
+def measure_noise(
     cycles: Sequence[SeenCycle], twists: TwistRecord, *, of_lines: bool = False
 ) -> MeasuredNoise | None:
     """Measure the noise of cones or of lines; None if not even the odometry's noise can be estimated."""

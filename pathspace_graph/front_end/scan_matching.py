@@ -23,7 +23,7 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
 
-from .line_matching import HEADING_TOLD, Limits, LineMatch, Seen
+from .line_matching import HEADING_TOLD, LineMatch, MatchLimits, Seen
 
 LEARNED_ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
 SIGMAS_ERRORS: Final = (0.02, 0.05)  # rad and s, first: those of a hasty mounting
@@ -144,7 +144,7 @@ def misfit_at(recent: RecentDetections, points_vehicle: Array, variances: Array,
     return float(np.minimum(square, MOST_MISFIT).mean()) if len(square) else 0.0
 
 
-MATCH_LIMITS: Final = Limits(FARTHEST, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED)
+MATCH_LIMITS: Final = MatchLimits(FARTHEST, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED)
 
 
 # --- errors of the sensor --------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from pathspace_graph.spline.ahead import TrackAhead, check_line, track_ahead
 from pathspace_graph.spline.boundary import Boundary
 
 from .gtsam_graph import window_graph
-from .queries import map_of, outline_of, readings_of, smoothed_at, track_ahead_of
+from .queries import readings_of, road_map, road_outline, smoothed_at, track_ahead_of
 
 
 class MapperEstimate:
@@ -46,7 +46,7 @@ class MapperEstimate:
 
         An open curve includes the tentative stretch that `outline` describes.
         """
-        return map_of(self.road, self._sigma_size)
+        return road_map(self.road, self._sigma_size)
 
     def outline(self) -> Map:
         """Return a copy of the map without covariances, in a hundredth of the time of `map`.
@@ -54,7 +54,7 @@ class MapperEstimate:
         Past `confirmed_until` an open curve is tentative: each call fits it through cones with fewer
         detections. A boundary without a confirmed curve may consist of a tentative stretch alone.
         """
-        return outline_of(self.road)
+        return road_outline(self.road)
 
     def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
         """Return the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.

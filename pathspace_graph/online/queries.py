@@ -16,7 +16,7 @@ from pathspace_graph.spline.ahead import CurveAhead, TrackAhead, track_ahead
 from .outlook import Outlook, confirmed, curves_ahead, joint_covariance_of, look_ahead
 
 
-def map_of(road: Road, sigma_size: float) -> Map:
+def road_map(road: Road, sigma_size: float) -> Map:
     """Return the map with the joint covariance of each boundary's control points, and the orange cones.
 
     `sigma_size` is the relative standard deviation of the map's size. The covariance of a closed curve
@@ -50,8 +50,8 @@ def _map_of(road: Road, sigma_size: float) -> Map:
     return Map(road.closed, boundaries, joint)
 
 
-def outline_of(road: Road) -> Map:
-    """Return the map without covariances, in a hundredth of the time of `map_of`."""
+def road_outline(road: Road) -> Map:
+    """Return the map without covariances, in a hundredth of the time of `road_map`."""
     with road.smoother.variables.looked_at():
         boundaries = {
             label: SplineBoundary(outlook.spline, NO_COVARIANCE, outlook.confirmed_until)

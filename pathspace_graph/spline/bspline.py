@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, Final, Literal, Self
+from typing import ClassVar, Final, Self
 
 import numpy as np
-import scipy  # imports its modules on first use
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
@@ -18,9 +17,6 @@ from pathspace_graph.factors.bspline import (
 )
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.se2 import left_of
-
-if TYPE_CHECKING:
-    from scipy.interpolate import BSpline as ScipyBSpline
 
 _PERIODIC_TOLERANCE: Final = 1e-9  # largest difference of repeated values, relative to 1 + the largest value
 _FOOT_GRID: Final = 8  # grid points on each span of a foot-point search over the whole curve
@@ -305,11 +301,6 @@ class BSpline:
         normal = self.normal_unit(u)
         variance = np.einsum("ka,kab,kb->k", normal, self.covariance_at(u, joint_covariance), normal)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-
-    def to_scipy(self) -> "ScipyBSpline":
-        """Convert the curve to scipy's class, which gives NaN outside the domain of an open curve."""
-        beyond: Literal["periodic", False] = "periodic" if self.periodic else False
-        return scipy.interpolate.BSpline(self.knots, self.control_points, self.degree, extrapolate=beyond)
 
     def _refuse_periodic(self, what: str) -> None:
         if self.periodic:

@@ -1,4 +1,4 @@
-"""Linear factors from arrays and back: the same to the last bit, and nothing that does not fit."""
+"""Linear factors from arrays: the same to the last bit, and nothing that does not fit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.linear import jacobian_matrix, keys_of_factor, linear_factor
+from pathspace_graph.factors.linear import keys_of_factor, linear_factor
 
 KEYS, WIDTHS = np.array([7, 3, 12, 5, 4], np.intp), np.array([2, 3, 2, 5, 2], np.intp)
 
@@ -23,7 +23,7 @@ def test_a_factor_on_five_keys_comes_back(count: int) -> None:
     A, b = rows(count)
     found = linear_factor(KEYS, WIDTHS, A, b)
     np.testing.assert_array_equal(keys_of_factor(found), KEYS)
-    np.testing.assert_array_equal(jacobian_matrix(found), np.column_stack([A, b]))
+    np.testing.assert_array_equal(found.augmentedJacobian(), np.column_stack([A, b]))
 
 
 def test_its_solution_is_that_of_least_squares() -> None:
@@ -33,12 +33,6 @@ def test_its_solution_is_that_of_least_squares() -> None:
     solution = graph.optimize()
     found = np.concatenate([solution.at(int(key)) for key in KEYS])
     np.testing.assert_allclose(found, np.linalg.lstsq(A, b, rcond=None)[0], atol=1e-12)
-
-
-def test_a_noise_model_is_refused() -> None:
-    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.5, 0.5]))
-    with pytest.raises(ValueError, match="expected whitened rows"):
-        jacobian_matrix(gtsam.JacobianFactor(1, np.eye(2), np.zeros(2), noise))
 
 
 def test_what_does_not_fit_is_refused() -> None:

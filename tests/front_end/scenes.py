@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
-from pathspace_graph.front_end.noise import measure
+from pathspace_graph.front_end.noise import measure_noise
 from pathspace_graph.front_end.sightings import SeenCycle, TwistRecord
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.labels import LEFT, RIGHT
@@ -81,7 +81,7 @@ class Camera:
 
     def found(self, seed: int) -> MeasuredNoise:
         """Returns what is measured on a drive."""
-        found = measure(*self.drive(seed))
+        found = measure_noise(*self.drive(seed))
         assert found is not None and found.along is not None and found.across is not None
         return found
 

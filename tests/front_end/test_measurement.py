@@ -27,7 +27,7 @@ from pathspace_graph.front_end.measurement import (
     ROUNDS_FIRST,
     Measurement,
 )
-from pathspace_graph.front_end.noise import measure
+from pathspace_graph.front_end.noise import measure_noise
 from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.log import Log
 from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
@@ -133,11 +133,11 @@ def test_the_drive_itself_is_told_too() -> None:
 
 def test_too_few_cones_say_nothing_of_the_sensor() -> None:
     cycles, twists = CAMERAS["white"].drive(0)
-    some = measure(cycles[:8], twists)
+    some = measure_noise(cycles[:8], twists)
     assert some is not None and some.along is None and some.across is None
     assert np.isinf(some.sensor_sigma).all()
     assert len(cycles[0].detections.labels) < MIN_ROWS
-    assert measure(cycles, TwistRecord()) is None
+    assert measure_noise(cycles, TwistRecord()) is None
 
 
 # --- simulated logs --------------------------------------------------------------------------------------
@@ -196,7 +196,7 @@ def test_a_biased_yaw_rate_is_not_taken_for_a_turned_sensor(bias: float) -> None
 
 def test_in_steps_it_is_the_same_and_none_is_long() -> None:
     cycles, twists = CAMERAS["white"].drive(0)
-    whole = measure(cycles, twists)
+    whole = measure_noise(cycles, twists)
     steps, parts = 0, Measurement.of(cycles, twists, None)
     assert parts is not None and whole is not None
     while (found := parts.advance()) is None:

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from pathspace_graph.baselines.landmark_association import (
     CREATE_GATE,
     MATCH_GATE,
-    associate,
+    assign,
     associate_created,
     associate_newest,
     compatible,
     hysteresis_costs,
     pair_costs,
-    predict,
+    predicted_points,
     squared_mahalanobis,
 )
 from pathspace_graph.baselines.landmark_map import AMBIGUOUS, UNASSOCIATED
@@ -41,32 +41,32 @@ def test_gates_are_those_of_two_degrees_of_freedom() -> None:
 
 def test_the_assignment_is_the_best_of_all_not_that_of_each_detection() -> None:
     cost = np.array([[1.0, 2.0], [1.5, 5.5]])  # greedy would take 1.0 and leave 5.5
-    np.testing.assert_array_equal(associate(cost)[0], [1, 0])
+    np.testing.assert_array_equal(assign(cost)[0], [1, 0])
 
 
 def test_a_bad_pair_is_not_taken_to_save_another() -> None:
     cost = np.array([[0.5, 50.0], [0.1, 50.0]])
-    landmark, _ = associate(cost)
+    landmark, _ = assign(cost)
     np.testing.assert_array_equal(landmark, [UNASSOCIATED, 0])
 
 
 def test_a_detection_between_the_gates_is_neither_associated_nor_new() -> None:
     between = 0.5 * (MATCH_GATE + CREATE_GATE)
-    landmark, is_new = associate(np.array([[between, 99.0], [99.0, 99.0], [99.0, 1.0]]))
+    landmark, is_new = assign(np.array([[between, 99.0], [99.0, 99.0], [99.0, 1.0]]))
     np.testing.assert_array_equal(landmark, [UNASSOCIATED, UNASSOCIATED, 1])
     np.testing.assert_array_equal(is_new, [False, True, False])
 
 
 @pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0)])
 def test_there_pairs_no_detections_or_no_landmarks(shape: tuple[int, int]) -> None:
-    landmark, is_new = associate(np.zeros(shape))
+    landmark, is_new = assign(np.zeros(shape))
     np.testing.assert_array_equal(landmark, np.full(shape[0], UNASSOCIATED))
     assert is_new.all()
 
 
 @given(arrays(float, (4, 5), elements=st.floats(0.0, 20.0) | st.just(np.inf)))
 def test_it_is_one_to_one_and_inside_the_gate(cost: Array) -> None:
-    landmark, is_new = associate(cost)
+    landmark, is_new = assign(cost)
     matched = np.flatnonzero(landmark != UNASSOCIATED)
     assert len(np.unique(landmark[matched])) == len(matched)
     assert (cost[matched, landmark[matched]] < MATCH_GATE).all()
@@ -110,7 +110,7 @@ def test_a_held_pair_is_kept_however_its_assignment_is_summed() -> None:
         (cost[:, ::-1], [UNASSOCIATED, 1]),
     ):
         held = np.isfinite(own)
-        assert associate(hysteresis_costs(own, held))[0].tolist() == expected
+        assert assign(hysteresis_costs(own, held))[0].tolist() == expected
 
 
 # --- online ----------------------------------------------------------------------------------------------
@@ -121,7 +121,7 @@ def test_the_prediction_is_that_of_a_step_with_the_new_pose() -> None:
     smoother = driven(6, noise=0.0)
     drive_on(smoother, 6, (SPEED, 0.0, 0.3))
     landmarks, state = np.array([2, 0]), smoother.map.state
-    predicted, covariances = predict(smoother, landmarks)
+    predicted, covariances = predicted_points(smoother, landmarks)
     pose, points = smoother.variables.poses[-1].copy(), state.landmarks[landmarks]
     rows = landmark_residuals(np.tile(pose, (2, 1)), points, np.zeros((2, 2)))
     np.testing.assert_allclose(predicted, rows.residual)
