@@ -59,7 +59,10 @@ def read_track(path: Path | str) -> Track:
     elif path.suffix.lower() == ".csv":
         text = read_text(path, most=limits.MAX_TRACK_BYTES)
         first = next(filter(str.strip, text.split("\n")), "").strip()
-        table = read_table(path, comment="#", header=_missing_header(first))
+        tag, *numbers = (part.strip(' "') for part in first.split(","))
+        is_cone = tag.lower() in EUFS_TAGS and len(numbers) >= 2 and all(map(is_number, numbers[:2]))
+        header = EUFS_COLUMNS[: 1 + len(numbers)] if is_cone else ()  # where the file has none
+        table = read_table(path, comment="#", header=header)
         if not {"x_m", "y_m"}.isdisjoint(table.columns):
             track = _tum(table)
         elif "tag" in table.columns:
@@ -182,13 +185,6 @@ def _without_repeats(row: Array, closed: bool) -> Array:
 
 
 # --- CSV: EUFS and TUM -------------------------------------------------------------------------------------
-
-
-def _missing_header(first: str) -> tuple[str, ...]:
-    """Columns of a file of cones without a header: its first row is a cone; none of any other file."""
-    tag, *numbers = (part.strip(' "') for part in first.split(","))
-    is_cone = tag.lower() in EUFS_TAGS and len(numbers) >= 2 and all(map(is_number, numbers[:2]))
-    return EUFS_COLUMNS[: 1 + len(numbers)] if is_cone else ()
 
 
 def _eufs(table: Table) -> Track:
