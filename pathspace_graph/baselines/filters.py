@@ -36,6 +36,7 @@ FILTER_REACH: Final = (
 )
 RECENT: Final = 2.0  # largest age of the detections that are laid on the early segment (s)
 SIGMA_TIE: Final = 0.15  # standard deviation of the distance between the ends of a curve at closure (m)
+SIGMA_ALONG: Final = 0.4  # standard deviation of the place on the early segment, along the curves (m)
 TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
 
@@ -159,8 +160,8 @@ def update_by_correspondences(state: CurveState, motion: Array) -> bool:
         rows.append(np.concatenate(by_axis))
         columns.append(state.columns(label, np.arange(spline.size)))
     matrix = block_diag(*rows)
-    along, counts = state.settings.closing.sigma_max, [len(r) // 2 for r in rows]
-    sigma = np.concatenate([np.repeat([SIGMA_TIE, along * np.sqrt(k)], k) for k in counts])
+    counts = [len(r) // 2 for r in rows]
+    sigma = np.concatenate([np.repeat([SIGMA_TIE, SIGMA_ALONG * np.sqrt(k)], k) for k in counts])
     measured, noise = np.zeros(len(matrix)), np.diag(sigma**2)
     state.belief.update(np.concatenate(columns), lambda x: x @ matrix.T, measured, noise)
     return True

@@ -12,7 +12,6 @@ from pathspace_graph.factors.se2 import path_lengths, to_map
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import SAMPLE
-from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import boundaries_cross, sampled
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.crossing import crossed_boundaries, crossings_told
@@ -20,6 +19,7 @@ from pathspace_graph.spline.crossing import crossed_boundaries, crossings_told
 from .start import aligned_odometry
 from .system import BatchSystem, Evaluation
 
+LEAST_USED: Final = 2.0 / 3.0  # least share of coloured detections on the curves of a closed result
 DRIVE_RATIO: Final = 2.5  # largest distance of a boundary from the drive, relative to the drive's from it
 DRIVE_PERCENTILE: Final = 95.0  # percentile of the poses' distances: the drive may begin or end off the track
 BENT_SIGMAS: Final = 4.0  # largest distance of an optimum's poses from odometry and revisits (sigmas)
@@ -57,7 +57,7 @@ def share_used(at: Evaluation, detections: DetectionTable) -> float:
     return float(detections.used[first].mean()) if first.any() else 0.0
 
 
-def objection(splines: Mapping[int, BSpline], poses: Array, used: float, settings: MapperSettings) -> str:
+def objection(splines: Mapping[int, BSpline], poses: Array, used: float) -> str:
     """Describe the evidence against a map of closed curves around the poses (P, 3) of a lap; empty if none.
 
     Both boundaries must be closed, and cross only at level crossings. The vehicle must cross neither, and
@@ -81,7 +81,7 @@ def objection(splines: Mapping[int, BSpline], poses: Array, used: float, setting
         wider = float(np.max(by_drive.query(curve[known])[0])) / aside
         if wider > DRIVE_RATIO:
             return f"a boundary has a stretch {wider:.1f} times as far from the drive as one driven along"
-    if used < settings.batch.closure.used:
+    if used < LEAST_USED:
         return f"only {used:.0%} of the detections lie on its boundaries".replace("%", " %")
     return ""
 
@@ -92,7 +92,7 @@ def evidence_against(
     """Describe the evidence against closed curves at an optimum, with their detections; empty if none."""
     poses, calibration = at.state.poses, at.state.variables.calibration
     used = share_used(at, detections)
-    return disagreement(system, poses, calibration) or objection(splines, poses, used, system.settings)
+    return disagreement(system, poses, calibration) or objection(splines, poses, used)
 
 
 def disagreement(system: BatchSystem, poses: Array, calibration: Array) -> str:

@@ -77,10 +77,8 @@ class Optimizer:
         curves = [*state.boundaries.values()]
         if not (settings.stations and curves and all(curve.periodic for curve in curves)):
             return self.run(state, gate, rounds)
-        for stations in (False, True):
-            at, _ = self.run(state, gate, rounds, rough=True, stations=stations)
-            state = at.state
-        return self.run(state, gate, rounds, stations=True)  # match again: more cones are unambiguous now
+        at, _ = self.run(state, gate, rounds, rough=True, stations=True)
+        return self.run(at.state, gate, rounds, stations=True)  # match again: more cones are unambiguous now
 
     def align_poses(self, state: State, gate: float) -> State:
         """Take one Gauss-Newton step of the poses alone, with fixed map and calibration."""

@@ -136,21 +136,11 @@ class RelinearizeSettings(Checked):
 
 
 @dataclass(frozen=True)
-class ClosureSettings(Checked, group="batch.closure"):
-    """When a closed loop is believed."""
-
-    used: float = 2.0 / 3.0
-    """Least share of the first lap's coloured detections on the curves of a closed result."""
-
-
-@dataclass(frozen=True)
 class OpenLapSettings(Checked, group="open_lap"):
     """Batch over the open lap, which closes the loop online."""
 
     cycles: int = 20
     """Cycles after the return at which the batch closes the loop, or as many as the window holds."""
-    cycles_share: float = 0.03
-    """Share of a long lap's cycles that replaces `cycles` where it is more; the window grows until then."""
     late: int = 100
     """Most cycles by which a batch may be late, after which it is abandoned, as beyond `max_poses`."""
     ends: tuple[int, ...] = ()
@@ -161,6 +151,8 @@ class OpenLapSettings(Checked, group="open_lap"):
     """Most cycles of an open lap that is solved as a batch; a longer one stays open."""
     max_cones: Unlimited = 1500.0
     """Most cones of a lap that is solved as a batch, since with more it would not be in time."""
+
+    cycles_share: ClassVar[float] = 0.03  # of a long lap's cycles, which replaces `cycles` where it is more
 
 
 @dataclass(frozen=True)
@@ -175,7 +167,6 @@ class BatchSettings(Checked):
     sigma_smoothness: float = 0.4
     """Standard deviation of the second difference of control points, as a share of their spacing: smaller
     than online, so that a curve between cones that were never detected has one best shape."""
-    closure: ClosureSettings = field(default_factory=ClosureSettings)
 
     dense_share: ClassVar[float] = 1.0  # control points for each cone of the curves that are solved for
     sigma_model: ClassVar[float] = 0.05  # m, of a cone's distance from these; online they have fewer points
@@ -189,8 +180,6 @@ class CkfSettings(Checked):
 
     ridge: float = 0.05
     """Lambda of the ridge regression, which ties control points to their places (paper: Update)."""
-    sigma_model: float = 0.25
-    """Standard deviation of a cone's distance from a smooth curve (m), added in each detection."""
     sigma_along: float = 1.0
     """Standard deviation of a cone's distance along the curve from its foot point (m), added likewise."""
     threshold: float = 4.0
@@ -203,6 +192,10 @@ class CkfSettings(Checked):
     with each extension."""
     sightings: int = 3
     """Detections that make a landmark of the baseline filter; its description has 1: every one."""
+
+    sigma_model: ClassVar[float] = (
+        0.25  # m, of a cone's distance from a smooth curve, added in each detection
+    )
 
 
 @dataclass(frozen=True)

@@ -24,24 +24,20 @@ class GrowthSettings(Checked):
     """Time without a detection after which a tentative track is dropped (s)."""
     max_size: float = 5000.0
     """Number of control points from which on an open curve grows no further."""
-    max_unseen: float = 500.0
-    """Longest stretch of an open curve without any cone (m)."""
 
+    max_unseen: ClassVar[float] = 500.0  # longest stretch of an open curve without any cone, m
     threshold: ClassVar[float] = 0.7  # m from a curve's end below which a tentative track does not extend it
     max_lateral: ClassVar[float] = 10.0  # m from the path at which tracks begin a boundary: half a wide road
 
 
 @dataclass(frozen=True)
 class ClosingSettings(Checked):
-    """When the loop may close, and how certain its registration must be."""
+    """When the loop may close."""
 
-    min_path: float = 60.0
-    """Least length of a lap (m)."""
-    sigma_max: float = 0.4
-    """Largest standard deviation of the registered position along its worst direction (m)."""
     gauge_laps: Unlimited = 4.0
     """Laps on the closed map after which its position and heading as a whole are fixed; `inf` for never."""
 
+    min_path: ClassVar[float] = 60.0  # least length of a lap, m
     check_interval: ClassVar[float] = 2.0  # m along the path, from one attempt to close the loop to the next
     radius: ClassVar[float] = 8.0  # m from the first stretch of the drive, within which the loop may close
     drift: ClassVar[float] = 0.03  # growth of `radius` with the path driven (m/m)

@@ -87,23 +87,23 @@ def circle(radius: float, centre: float = 0.0, begin: float = 0.0) -> Array:
 
 
 def test_nothing_speaks_against_a_road_around_its_drive() -> None:
-    assert objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0), USED, SETTINGS) == ""
+    assert objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0), USED) == ""
 
 
 def test_boundaries_that_cross_are_no_road() -> None:
-    against = objection({LEFT: ring(18.0), RIGHT: ring(24.0, 8.0)}, circle(15.0), USED, SETTINGS)
+    against = objection({LEFT: ring(18.0), RIGHT: ring(24.0, 8.0)}, circle(15.0), USED)
     assert against == "its boundaries cross"
 
 
 def test_a_vehicle_crosses_no_boundary() -> None:
-    against = objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0, 4.0), USED, SETTINGS)
+    against = objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0, 4.0), USED)
     assert "boundary lies across the driven path" in against
 
 
 def test_a_vehicle_has_driven_beside_all_of_a_boundary() -> None:
     """A quarter of the circle was never driven: the curves only bridge it."""
     driven = circle(20.0)[:45]
-    against = objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, driven, USED, SETTINGS)
+    against = objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, driven, USED)
     assert against.startswith("a boundary has a stretch ")
     assert against.endswith(" times as far from the drive as one driven along")
 
@@ -117,13 +117,13 @@ def test_where_cycles_are_missing_nothing_is_asked_of_the_boundaries(begin: floa
     curves = {LEFT: ring(18.0), RIGHT: ring(24.0)}
     whole = circle(20.0, begin=begin)
     without = np.delete(whole, np.arange(20, 35), axis=0)
-    assert objection(curves, without, USED, SETTINGS) == ""
+    assert objection(curves, without, USED) == ""
     narrow = {LEFT: ring(18.0), RIGHT: ring(24.0, 8.0)}
-    assert objection(narrow, np.delete(circle(15.0), np.arange(20, 35), axis=0), USED, SETTINGS) != ""
+    assert objection(narrow, np.delete(circle(15.0), np.arange(20, 35), axis=0), USED) != ""
 
 
 def test_the_detections_of_a_lap_lie_on_its_boundaries() -> None:
-    against = objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0), 0.62, SETTINGS)
+    against = objection({LEFT: ring(18.0), RIGHT: ring(24.0)}, circle(20.0), 0.62)
     assert against == "only 62 % of the detections lie on its boundaries"
 
 
@@ -143,4 +143,4 @@ def test_both_boundaries_of_a_lap_are_closed() -> None:
     left, right = ring(18.0), ring(24.0)
     arc = replace(right, periodic=False)
     for curves in ({LEFT: left}, {LEFT: left, RIGHT: arc}):
-        assert objection(curves, circle(20.0), USED, SETTINGS) == "not both of its boundaries are closed"
+        assert objection(curves, circle(20.0), USED) == "not both of its boundaries are closed"

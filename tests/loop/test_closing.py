@@ -16,6 +16,7 @@ from pathspace_graph.labels import LEFT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import Knots, MapperSettings
+from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import relocate
 
 from ..scenes.drives import (
@@ -161,14 +162,14 @@ def test_an_open_track_stays_open() -> None:
     assert not mapper.map().closed
 
 
-def test_no_loop_is_shorter_than_the_shortest(log: Log) -> None:
-    settings = MapperSettings()
-    settings = replace(settings, closing=replace(settings.closing, min_path=1000.0))
-    mapper = FixedLagMapper(settings, ODOMETRY_SIGMA)
+def test_no_loop_is_shorter_than_the_shortest(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper = FixedLagMapper(None, ODOMETRY_SIGMA)
+    monkeypatch.setattr(ClosingSettings, "min_path", 1000.0)
     for odometry, cycle in split_odometry(replace(log, cycles=log.cycles[:175])):
         mapper.update(odometry, cycle)
     assert not mapper.closed
-    assert not mapper.road.path.near_beginning(mapper.poses[-1], settings.closing)
+    assert not mapper.road.path.near_beginning(mapper.poses[-1], ClosingSettings())
+    monkeypatch.undo()
     assert mapper.road.path.near_beginning(mapper.poses[-1], MapperSettings().closing)
 
 

@@ -46,7 +46,7 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[Lap]:
 
 
 def solver(**changes: Any) -> LapSolver:
-    return LapSolver(MapperSettings(open_lap=OpenLapSettings(cycles=20, cycles_share=0.03, **changes)))
+    return LapSolver(MapperSettings(open_lap=OpenLapSettings(cycles=20, **changes)))
 
 
 def begin(solver: LapSolver, first: int, cycle: int) -> None:

@@ -186,4 +186,5 @@ def test_near_the_start_is_a_matter_of_place_and_direction(
         path.update(compose(frame, np.array([x, 0.0, 0.0])))
     there = compose(frame, np.array(pose))
     assert path.near_beginning(there, ClosingSettings()) is near
-    assert not path.near_beginning(there, ClosingSettings(min_path=100.0))
+    monkeypatch.setattr(ClosingSettings, "min_path", 100.0)
+    assert not path.near_beginning(there, ClosingSettings())

@@ -353,9 +353,11 @@ def blind_after(seconds: float, length: float) -> Log:
     return replace(log, cycles=cycles)
 
 
-def test_a_stranded_end_is_carried_on_a_bounded_way_and_that_is_said_once() -> None:
-    settings = MapperSettings(growth=GrowthSettings(max_unseen=60.0))
-    mapper, results = map_log(blind_after(2.0, 200.0), FixedLagMapper(settings))
+def test_a_stranded_end_is_carried_on_a_bounded_way_and_that_is_said_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(GrowthSettings, "max_unseen", 60.0)
+    mapper, results = map_log(blind_after(2.0, 200.0), FixedLagMapper())
     for boundary in mapper.boundaries.values():
         assert 50.0 < boundary.unseen <= 60.0
     notices = [result.notice for result in results if result.notice]
