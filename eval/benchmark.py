@@ -15,16 +15,15 @@ from typing import Any, Final, NamedTuple
 import gtsam
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, ScalarFormatter, StrMethodFormatter
 from numpy.random import Generator
 from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.console import progress
 from pathspace_graph.estimators import make_online
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.se2 import compose, to_map
 from pathspace_graph.io.files import atomic_folder, write_json
@@ -43,8 +42,7 @@ from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.sim.vehicle import VehicleSettings
 
 from .experiment.provenance import code_of
-from .experiment.run import rows_of
-from .experiment.runner import OnCell
+from .experiment.run import OnCell, rows_of
 from .experiment.tables import Table, write_csv
 from .figures import style
 from .figures.style import MARKERS, PALETTE, WIDTH
@@ -91,13 +89,31 @@ class ToldLandmarks:
         self._seen: set[int] = set()
 
     def advance(self) -> float:
-        """Take the next cycle; return the processor time (s) of its update."""
+        """Take the next cycle; return the processor time (s) of its update. False positives are left out."""
         odometry, detections = next(self._cycles)
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        key = gtsam.symbol("x", self._count)
-        self._add_pose(graph, odometry, detections.t)
+        cones, graph, values = next(self._cones), gtsam.NonlinearFactorGraph(), gtsam.Values()
+        key, noises = gtsam.symbol("x", self._count), gtsam.noiseModel
+        if self._count == 0:
+            known = noises.Diagonal.Sigmas(np.array([1e-3, 1e-3, 1e-4]))  # the origin of the map
+            graph.add(gtsam.PriorFactorPose2(key, gtsam.Pose2(), known))
+        else:
+            motion = integrate_odometry(odometry, detections.t, self._sigma)
+            noise = noises.Gaussian.Covariance(motion.covariance)
+            graph.add(gtsam.BetweenFactorPose2(key - 1, key, gtsam.Pose2(*motion.delta), noise))
+            self._pose = compose(self._pose, motion.delta)
         values.insert(key, gtsam.Pose2(*self._pose))
-        self._add_detections(graph, values, detections, next(self._cones))
+        points = detections.points_vehicle
+        ranges, points_map = np.hypot(*points.T), to_map(points, self._pose[None])
+        along, across = ray_sigmas(points, detections.covariances).T
+        for i in np.flatnonzero(cones >= 0).tolist():
+            cone = int(cones[i])
+            landmark = gtsam.symbol("l", cone)
+            if cone not in self._seen:
+                self._seen.add(cone)
+                values.insert(landmark, points_map[i])
+            bearing = gtsam.Rot2.relativeBearing(points[i])
+            noise = noises.Diagonal.Sigmas(np.array([across[i] / ranges[i], along[i]]))
+            graph.add(gtsam.BearingRangeFactor2D(key, landmark, bearing, ranges[i], noise))
         begin = time.thread_time()
         self.isam.update(graph, values)
         newest = self.isam.calculateEstimatePose2(key)
@@ -106,42 +122,9 @@ class ToldLandmarks:
         self._count += 1
         return seconds
 
-    def _add_pose(self, graph: gtsam.NonlinearFactorGraph, odometry: Odometry, t: float) -> None:
-        key = gtsam.symbol("x", self._count)
-        if self._count == 0:
-            known = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-3, 1e-3, 1e-4]))  # the origin of the map
-            graph.add(gtsam.PriorFactorPose2(key, gtsam.Pose2(), known))
-            return
-        motion = integrate_odometry(odometry, t, self._sigma)
-        noise = gtsam.noiseModel.Gaussian.Covariance(motion.covariance)
-        graph.add(gtsam.BetweenFactorPose2(key - 1, key, gtsam.Pose2(*motion.delta), noise))
-        self._pose = compose(self._pose, motion.delta)
-
-    def _add_detections(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, detections: Detections, cones: IntArray
-    ) -> None:
-        """Add bearing and range of each detection of a cone; false positives are left out."""
-        points, key = detections.points_vehicle, gtsam.symbol("x", self._count)
-        ranges = np.hypot(*points.T)
-        along, across = ray_sigmas(points, detections.covariances).T
-        sigmas = np.stack([across / ranges, along], axis=1)
-        points_map = to_map(points, self._pose[None])
-        for i in np.flatnonzero(cones >= 0).tolist():
-            cone = int(cones[i])
-            landmark = gtsam.symbol("l", cone)
-            if cone not in self._seen:
-                self._seen.add(cone)
-                values.insert(landmark, points_map[i])
-            bearing = gtsam.Rot2.relativeBearing(points[i])
-            noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas[i])
-            graph.add(gtsam.BearingRangeFactor2D(key, landmark, bearing, ranges[i], noise))
-
 
 def speed_of_drive(seed: int, laps: int) -> dict[str, float]:
-    """Map a simulated drive on a generated track; return the figures of `SPEED`.
-
-    The seed is that of the track, the drive and its noise.
-    """
+    """Map a drive on a generated track, both of this seed; return the figures of `SPEED`."""
     track = generate_track(np.random.default_rng(seed))
     return speed_on(simulate(track, SimulationSettings(laps=laps), seed), MapperSettings())
 
@@ -237,7 +220,8 @@ def make_drives(settings: ScalingSettings) -> dict[str, Sweep]:
     seen = cones_seen(long)
     count = int(np.searchsorted(seen, settings.cones_max)) + 1
     low, high = np.log(settings.cones_min), np.log(settings.cones_max + 1.0)
-    cones = Part(first_cycles(long, count), seen[:count].astype(float))
+    until_seen = replace(long, cycles=long.cycles[:count], truth=None)
+    cones = Part(until_seen, seen[:count].astype(float))
     dense_road, far = open_road(settings.readings_cones, DENSE_GAP), SensorSettings(range_max=DENSE_RANGE)
     dense, readings = drive_log(dense_road, seed, sensor=far), []
     for wanted in settings.readings:
@@ -308,19 +292,14 @@ def cones_seen(log: Log) -> IntArray:
     return np.searchsorted(np.sort(first[seen >= 0]), ends, side="left")
 
 
-def first_cycles(log: Log, count: int) -> Log:
-    """Return the first `count` cycles of a log, without truth."""
-    return replace(log, cycles=log.cycles[:count], truth=None)
-
-
 def thinned(log: Log, count: int, rng: Generator) -> Log:
     """Return the drive with `count` detections a cycle, chosen at random, or all where there are fewer."""
-
-    def chosen(size: int) -> BoolArray:
-        return np.isin(np.arange(size), rng.choice(size, min(count, size), replace=False))
-
-    cycles = tuple(cycle.where(chosen(len(cycle.labels))) for cycle in log.cycles)
-    return replace(log, cycles=cycles, truth=None)
+    cycles = []
+    for cycle in log.cycles:
+        size = len(cycle.labels)
+        chosen = rng.choice(size, min(count, size), replace=False)
+        cycles.append(cycle.where(np.isin(np.arange(size), chosen)))
+    return replace(log, cycles=tuple(cycles), truth=None)
 
 
 # --- updates of the sweeps -------------------------------------------------------------------------------
@@ -417,10 +396,8 @@ def sweep_rows(
     run_lanes(lanes, mapper, settings.budget, on_cycle)
     rows: list[dict[str, Any]] = []
     for estimator in estimators:
-        own, about = (
-            [of for of in lanes if of.estimator == estimator],
-            {"sweep": name, "estimator": estimator},
-        )
+        about = {"sweep": name, "estimator": estimator}
+        own = [lane for lane in lanes if lane.estimator == estimator]
         found = [binned(lane, sweep.edges) for lane in own]
         points = pd.concat([of for of in found if len(of)] or found[:1], ignore_index=True)
         stopped = "; ".join(f"{lane.part.name}{lane.stopped}" for lane in own if lane.stopped)
@@ -434,10 +411,6 @@ def sweep_rows(
 MARKER: Final = "scaling.json"  # file by which a folder of results is known
 COMPARED_AT: Final = 200.0  # number of cones at which estimators are compared, that of an ordinary track
 _HEIGHT: Final = 3.1  # height of a figure (in)
-_TITLES: Final = {  # axis title and title of each panel
-    CONES: ("cones seen", "(a) map size"),
-    READINGS: ("detections per update", "(b) detections"),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -466,11 +439,6 @@ class Scaling:
             return float("nan")
         at, seconds = np.log(points["at"]), np.log(points["seconds"])
         return float(np.exp(np.interp(np.log(cones), at, seconds, left=np.nan, right=np.nan)))
-
-    def seconds_on_line(self, estimator: str) -> float:
-        """Return the mean update (s) on dense lines; NaN where the estimator was stopped."""
-        stopped = self.slope(DENSE_LINE, estimator)["stopped"]
-        return float("nan") if stopped else float(self.of(DENSE_LINE, estimator)["seconds"].iloc[0])
 
 
 def measure_scaling(
@@ -523,7 +491,8 @@ def scaling_table(scaling: Scaling) -> Table:
         at, laps = scaling.seconds_at(COMPARED_AT, name), scaling.of(LAPS, name).set_index("at")["seconds"]
         alone = [1e3 * at, scaling.seconds_at(COMPARED_AT, first) / at, scaling.of(CONES, name)["at"].max()]
         alone += [1e3 * laps.get(float(lap), math.nan) for lap in shown]
-        alone.append(1e3 * scaling.seconds_on_line(name))
+        on_line = scaling.of(DENSE_LINE, name)["seconds"]
+        alone.append(math.nan if scaling.slope(DENSE_LINE, name)["stopped"] else 1e3 * on_line.iloc[0])
         rows.append((name, *both, *figures(alone, 1, 2, 0, *[1] * len(shown), 1)))
     return Table.of(header, rows, "Time per update: slopes of the logarithms, ± standard error")
 
@@ -531,9 +500,10 @@ def scaling_table(scaling: Scaling) -> Table:
 def stops(scaling: Scaling) -> list[str]:
     """Return a line for each estimator and sweep that did not reach the end."""
     lines = []
-    for row in (row for row in scaling.slopes.to_dict("records") if row["stopped"]):
-        reached = f" (slope to {row['high']:.0f})" if row["points"] else ""
-        lines.append(f"{row['estimator']}, {row['sweep']}: stopped, {row['stopped']}{reached}")
+    for row in scaling.slopes.to_dict("records"):
+        if row["stopped"]:
+            reached = f" (slope to {row['high']:.0f})" if row["points"] else ""
+            lines.append(f"{row['estimator']}, {row['sweep']}: stopped, {row['stopped']}{reached}")
     return lines
 
 
@@ -558,40 +528,39 @@ def write_scaling(out: Path, scaling: Scaling, *, force: bool = False) -> None:
 
 def plot_scaling(scaling: Scaling) -> Figure:
     """Draw two sweeps on logarithmic axes, with fitted lines, and a cross where an estimator was stopped."""
+    titles = {CONES: ("cones seen", "(a) map size"), READINGS: ("detections per update", "(b) detections")}
+    ticks = {
+        CONES: [n for n in (50, 100, 200, 500, 1000, 2000) if n <= scaling.settings.cones_max],
+        READINGS: scaling.settings.readings,
+    }
     with style.figure_context():
         figure = Figure(figsize=(WIDTH, _HEIGHT), layout="constrained")
-        cones, detections = figure.subplots(1, 2, sharey=True)
-        for axes, sweep in ((cones, CONES), (detections, READINGS)):
+        panels = figure.subplots(1, 2, sharey=True)
+        for axes, (sweep, (abscissa, title)) in zip(panels, titles.items(), strict=True):
             for name, color, marker in zip(
                 scaling.estimators, cycled(PALETTE), cycled(MARKERS), strict=False
             ):
-                _draw_sweep(axes, scaling, sweep, name, {"color": color, "marker": marker})
-            abscissa, title = _TITLES[sweep]
+                points, slope = scaling.of(sweep, name), scaling.slope(sweep, name)
+                at, milliseconds = points["at"], 1e3 * points["seconds"]
+                if not len(points):
+                    continue
+                axes.plot(at, milliseconds, marker, color=color, label=name, markersize=3.6)
+                if np.isfinite(slope["slope"]):
+                    ends = slope[["low", "high"]].to_numpy(float)
+                    fitted = points[at.between(*ends)][["at", "seconds"]]
+                    middle, seconds = np.exp(np.log(fitted).mean())
+                    law = 1e3 * seconds * (ends / middle) ** slope["slope"]
+                    axes.plot(ends, law, color=color, linewidth=0.9, alpha=0.8)
+                if sweep == CONES and slope["stopped"]:
+                    axes.plot(at.iloc[-1], milliseconds.iloc[-1], "x", color=color, markersize=10.8)
             axes.set(xscale="log", yscale="log", xlabel=abscissa, title=title)
-            style.label_logarithms(axes)
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
             axes.grid(which="both")
-        cones.set_ylabel("mean update [ms]")
-        ticks = [n for n in (50, 100, 200, 500, 1000, 2000) if n <= scaling.settings.cones_max]
-        for axes, labelled in ((cones, ticks), (detections, scaling.settings.readings)):
-            axes.xaxis.set_major_locator(FixedLocator(labelled))
+            axes.xaxis.set_major_locator(FixedLocator(ticks[sweep]))
             axes.xaxis.set_major_formatter(ScalarFormatter())
             axes.xaxis.set_minor_formatter(NullFormatter())
-        style.shared_legend(figure, columns=min(len(scaling.estimators), 4))
+        panels[0].set_ylabel("mean update [ms]")
+        style.shared_legend(figure)
     return figure
-
-
-def _draw_sweep(axes: Axes, scaling: Scaling, sweep: str, name: str, look: dict[str, Any]) -> None:
-    """Draw the points of an estimator, its power law, and a cross where it was stopped."""
-    points, slope = scaling.of(sweep, name), scaling.slope(sweep, name)
-    if not len(points):
-        return
-    milliseconds = 1e3 * points["seconds"]
-    axes.plot(points["at"], milliseconds, linestyle="none", label=name, linewidth=0.7, markersize=3.6, **look)
-    if np.isfinite(slope["slope"]):
-        ends = slope[["low", "high"]].to_numpy(float)
-        fitted = points[points["at"].between(*ends)][["at", "seconds"]]
-        at, seconds = np.exp(np.log(fitted).mean())
-        law = 1e3 * seconds * (ends / at) ** slope["slope"]
-        axes.plot(ends, law, color=look["color"], linewidth=0.9, alpha=0.8)
-    if sweep == CONES and slope["stopped"]:
-        axes.plot(points["at"].iloc[-1], milliseconds.iloc[-1], "x", color=look["color"], markersize=10.8)

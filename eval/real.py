@@ -1,8 +1,8 @@
 """Logs of a real car without truth, mapped in three ways and compared with each other (docs/real.md)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,12 +20,11 @@ from pathspace_graph.io.map import Map, read_map
 from pathspace_graph.io.results import TRAJECTORY_FILE
 from pathspace_graph.io.tables import read_trajectory
 
-from .experiment.run import EstimatorCell, make_plan, run_records
-from .experiment.runner import Record, run_folder
+from .cars import solve_alone
+from .experiment.run import make_plan, run_folder, run_records
 from .experiment.statistics import estimate
 from .experiment.study import Study
 from .experiment.tables import Table
-from .joint import solve_alone
 from .metrics.accuracy import crossings
 from .metrics.alignment import aligned_distance, maps_apart
 from .metrics.metric import UNKNOWN, figure, figures
@@ -65,29 +64,31 @@ class RealDrive:
 
 
 def map_real_logs(logs: Sequence[Path], out: Path, **how: Any) -> list[RealDrive]:
-    """Map logs that `convert` has written by all estimators of `RUNS`; `how` is that of `run_records`."""
+    """Map logs that `convert` has written by all estimators of `RUNS`; `how` is that of `run_records`.
+
+    SolveError where one has failed.
+    """
     folders = {folder.name: (folder,) for folder in logs}
     plan = make_plan(Study(name="real", logs=folders, estimators=tuple(RUNS.values())), keep=True)
-    records = run_records(plan, out, **how)
-    return [_drive(plan.cells[i : i + len(RUNS)], out, records) for i in range(0, len(plan.cells), len(RUNS))]
-
-
-def _drive(cells: Sequence[EstimatorCell], out: Path, records: Mapping[str, Record]) -> RealDrive:
-    """Return the drive of the cells of a log, one for each of `RUNS`; SolveError where one has failed."""
-    if failed := [one for cell in cells if (one := records[cell.id]["failure"])]:
-        raise SolveError(f"{cells[0].drive.source}: {failed[0]}")
-    runs = {name: run_folder(out, cell) for name, cell in zip(RUNS, cells, strict=True)}
-    log, _ = cells[0].drive.load()
-    seen, _ = seen_cycles(log)
-    return RealDrive(
-        cells[0].drive.source,
-        log,
-        {name: read_map(folder) for name, folder in runs.items()},
-        {name: read_trajectory(folder / TRAJECTORY_FILE)[1][-1] for name, folder in runs.items()},
-        {name: records[cell.id]["rows"][-1] for name, cell in zip(RUNS, cells, strict=True)},
-        seen[-1].pose,
-        UNMEASURED if log.measured is None else end_by_registration(seen, log.measured),
-    )
+    records, drives = run_records(plan, out, **how), list[RealDrive]()
+    for drive, group in groupby(plan.cells, key=lambda cell: cell.drive):
+        cells = dict(zip(RUNS, group, strict=True))
+        if failed := [one for cell in cells.values() if (one := records[cell.id]["failure"])]:
+            raise SolveError(f"{drive.source}: {failed[0]}")
+        runs = {name: run_folder(out, cell) for name, cell in cells.items()}
+        log, _ = drive.load()
+        seen, _ = seen_cycles(log)
+        real = RealDrive(
+            drive.source,
+            log,
+            {name: read_map(folder) for name, folder in runs.items()},
+            {name: read_trajectory(folder / TRAJECTORY_FILE)[1][-1] for name, folder in runs.items()},
+            {name: records[cell.id]["rows"][-1] for name, cell in cells.items()},
+            seen[-1].pose,
+            UNMEASURED if log.measured is None else end_by_registration(seen, log.measured),
+        )
+        drives.append(real)
+    return drives
 
 
 def runs_table(drives: Sequence[RealDrive]) -> Table:
@@ -114,8 +115,7 @@ def maps_table(drives: Sequence[RealDrive]) -> Table:
     """Return the distance between the maps of each two drives around the same cones: under a metre."""
     rows = []
     for first, second in combinations(drives, 2):
-        both = zip(first.maps.values(), second.maps.values(), strict=True)
-        apart = [aligned_distance(one, other) for one, other in both]
+        apart = [aligned_distance(first.maps[name], second.maps[name]) for name in RUNS]
         if min(apart) < 1.0:
             rows.append((f"{first.name}, {second.name}", *figures(apart, 2)))
     return Table.of(("maps", *(f"{name} [m]" for name in RUNS)), rows)
@@ -125,15 +125,12 @@ def joint_table(drives: Sequence[RealDrive]) -> Table:
     """Return how far each drive's own batch is from that of all drives, and both from the last pose."""
     alone = {drive.name: solve_alone(drive.log) for drive in drives}
     joint, rows = join(alone), []
-    for drive in drives:
-        if drive.name not in joint.drives:
-            continue
+    for drive in (drive for drive in drives if drive.name in joint.drives):
         own = joint.drives[drive.name]
         apart = maps_apart(alone[drive.name].map, own.map).statistics()["both"]
         pose = compose(inverse(joint.frames[drive.name]), own.trajectory[-1])
         ends = drive.off(alone[drive.name].trajectory[-1])[0], drive.off(pose)[0]
-        values = [apart["mean"], apart["rms"], apart["p95"], apart["max"], *ends]
-        rows.append((drive.name, *figures(values, 2)))
+        rows.append((drive.name, *figures([*apart.values(), *ends], 2)))
     apart_by = ("map apart, mean [m]", "rms [m]", "p95 [m]", "largest [m]")
     return Table.of(("drive", *apart_by, "end off by, alone [m]", "together [m]"), rows)
 
@@ -154,9 +151,8 @@ def measured_table(drives: Sequence[RealDrive]) -> Table:
         values = [*found.odometry, *(ray.sigmas(at)[0] for ray in rays), *(100.0 * ray.share for ray in rays)]
         errors.append(found.sensor[places] * units)
         halves = 1.96 * found.sensor_sigma[places] * units
-        pairs = zip(errors[-1].tolist(), halves.tolist(), strict=True)
-        found_errors = (figure(v, h, 1) for v, h in pairs)
-        rows.append((drive.name, *figures(values, 4, 4, 4, 2, 2, 0, 0), *found_errors))
+        texts = (figure(*pair, 1) for pair in zip(errors[-1].tolist(), halves.tolist(), strict=True))
+        rows.append((drive.name, *figures(values, 4, 4, 4, 2, 2, 0, 0), *texts))
     if len(errors) > 1:
         means = (estimate(column).text(1) for column in np.transpose(errors))
         rows.append(("all drives", *[UNKNOWN] * 7, *means))

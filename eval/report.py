@@ -17,18 +17,16 @@ from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.io.parsing import parse_toml, read_text
 from pathspace_graph.settings.evaluation import ScalingSettings
 
-from . import joint, known, real
+from . import cars, real
 from .benchmark import QUICK, SPEED, make_drives, measure_scaling, scaling_table, speed_of_drive
-from .cars import on_tracks
-from .experiment.drives import Drive
 from .experiment.faults import at_strength, fault_table, kinds, only, outcomes
 from .experiment.provenance import made
 from .experiment.run import RowsOf, make_plan, rows_of, run_study
 from .experiment.statistics import RUN_OF, estimate, last_laps
-from .experiment.study import Study, find_study, read_study_file
+from .experiment.study import Drive, Study, find_study, read_study_file
 from .experiment.tables import Table, by_metric, by_name, contrast_table, mean, write_csv
 from .metrics.metric import METRICS, UNKNOWN
-from .metrics.reference import landmark_limit
+from .metrics.reference import landmark_rmse, solve_oracle_landmarks, truth_of
 
 ONLINE, BATCH, LANDMARKS = "fixed-lag", "spline", "landmark-fixed-lag"
 GENERATED: Final = (0, 1, 2)  # seeds of the generated tracks of the benchmark
@@ -40,7 +38,7 @@ Tables = dict[str, Table]  # tables of an experiment, by what follows its name; 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class ReportPlan:
     """What is driven; each experiment keeps its runs in a folder, and returns the tables that it measures."""
 
     quick: bool = False  # drive little, to see that everything works
@@ -63,9 +61,9 @@ class Plan:
             study = at_strength(study, 0.5)
             study = only(study, kinds(study)[:1]) if self.quick else study
         if self.quick:
-            study = smaller(
-                first_variant(study), about.get("quick", {"tracks": [0], "seeds": [0], "laps": 1})
-            )
+            grids = tuple({key: values[:1] for key, values in grid.items()} for grid in study.grids[:1])
+            study = replace(study, grids=grids, variants=dict([*study.variants.items()][:1]))
+            study = smaller(study, about.get("quick", {"tracks": [0], "seeds": [0], "laps": 1}))
         frame = run_study(study, folder, **self.how)
         if "beside" in about:
             other = run_study(smaller(study, about["beside"]), folder / "beside", **self.how)
@@ -75,21 +73,22 @@ class Plan:
             options = {key: value for key, value in wanted.items() if key != "kind"}
             found[part] = KINDS[wanted["kind"]](study, frame, **options)
         if folder.name == "camera":
-            plan = make_plan(study)
-            drives = [d for d in dict.fromkeys(cell.drive for cell in plan.cells) if isinstance(d, Drive)]
-            parts = [{"track": d.track, "settings": d.simulation, "seed": d.own_seed} for d in drives]
-            limit = mean("rmse", self.rows(landmark_limit, parts, folder / "landmarks"))
+            drives = dict.fromkeys(cell.drive for cell in make_plan(study).cells)
+            limits = self.rows(landmark_limit, [{"drive": drive} for drive in drives], folder / "landmarks")
+            limit = mean("rmse", limits)
             frame = found[""].frame
             frame.loc[len(frame)] = ["landmarks, given all", limit, *[UNKNOWN] * (frame.shape[1] - 2)]
         return found
 
     def joint(self, folder: Path) -> Tables:
         tracks, drives = ((50,), 2) if self.quick else ((50, 51, 52), 8)
-        return {"": joint.joint_table(self.rows(joint.of_track, on_tracks(tracks, drives=drives), folder))}
+        parts = cars.on_tracks(tracks, drives=drives)
+        return {"": cars.joint_table(self.rows(cars.joint_of_track, parts, folder))}
 
     def known(self, folder: Path) -> Tables:
         tracks, begins = ((60,), (0.3,)) if self.quick else (range(60, 68), (0.0, 0.3, 0.6))
-        return {"": known.known_table(self.rows(known.of_track, on_tracks(tracks, begins=begins), folder))}
+        parts = cars.on_tracks(tracks, begins=begins)
+        return {"": cars.known_table(self.rows(cars.known_of_track, parts, folder))}
 
     def speed(self, _: Path) -> Tables:
         """Time every estimator in turn on the same cycles."""
@@ -118,11 +117,21 @@ class Plan:
         return rows_of(function, parts, folder, **self.how)
 
 
-EXPERIMENTS: Final[Mapping[str, Callable[[Plan, Path], Tables]]] = {
-    **dict.fromkeys(STUDIES, Plan.study),
-    **{"known": Plan.known, "joint": Plan.joint, "speed": Plan.speed, "scale": Plan.scale},
-    "real": Plan.real_logs,
+EXPERIMENTS: Final[Mapping[str, Callable[[ReportPlan, Path], Tables]]] = {
+    **dict.fromkeys(STUDIES, ReportPlan.study),
+    "known": ReportPlan.known,
+    "joint": ReportPlan.joint,
+    "speed": ReportPlan.speed,
+    "scale": ReportPlan.scale,
+    "real": ReportPlan.real_logs,
 }
+
+
+def landmark_limit(drive: Drive) -> list[dict[str, Any]]:
+    """Return the rmse (m) of the landmark batch that is told all about a drive."""
+    log, _ = drive.load()
+    rmse = landmark_rmse(solve_oracle_landmarks(log)[1], truth_of(log))
+    return [{"track": drive.track, "rmse": rmse}]
 
 
 def smaller(study: Study, parts: Mapping[str, Any]) -> Study:
@@ -131,13 +140,7 @@ def smaller(study: Study, parts: Mapping[str, Any]) -> Study:
     return replace(study, **{**parts, "noise": noise})
 
 
-def first_variant(study: Study) -> Study:
-    """Return a study with its first variant and the first value of its first grid."""
-    grids = tuple({key: values[:1] for key, values in grid.items()} for grid in study.grids[:1])
-    return replace(study, grids=grids, variants=dict([*study.variants.items()][:1]))
-
-
-def write_report(plan: Plan, folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Table]]:
+def write_report(plan: ReportPlan, folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Table]]:
     """Run experiments, by default all that the plan has logs for; write and yield each table."""
     for name in names:
         check_name(name, EXPERIMENTS, "--only: expected an experiment")

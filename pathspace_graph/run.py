@@ -60,7 +60,7 @@ class CycleResult(Brief):
 
 @runtime_checkable
 class OnlineEstimator(Protocol):
-    """Interface of an online estimator; `docs/estimators.md` lists optional methods."""
+    """Interface of an online estimator; `docs/extending.md` lists optional methods."""
 
     @property
     def settings(self) -> Any:

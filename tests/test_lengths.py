@@ -178,8 +178,8 @@ def test_metrics_are_those_of_scale_one_times_the_scale() -> None:
     assert second["final"]["rmse"] == pytest.approx(10.0 * first["final"]["rmse"], rel=1e-6)
     assert second["final"]["missed"] == first["final"]["missed"]
     assert len(laps_of(found, larger)) == len(laps_of(known, log))
-    over_scale = measure(found, larger)[-1].values
-    assert over_scale["rmse"] == pytest.approx(measure(known, log)[-1].values["rmse"], rel=1e-6)
+    over_scale = measure(found, larger)[-1]
+    assert over_scale["rmse"] == pytest.approx(measure(known, log)[-1]["rmse"], rel=1e-6)
 
 
 def test_a_small_scene_is_no_mistake_of_a_log_that_says_so() -> None:

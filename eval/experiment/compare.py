@@ -1,9 +1,8 @@
 """Every estimator on the same logs: the paper's Table 1, all metrics, and all files."""
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Final
@@ -24,12 +23,10 @@ from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE
 from pathspace_graph.io.tables import read_trajectory
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .drives import log_folders
 from .plots import Drawn, plot_maps
-from .run import EstimatorCell, Plan, add_batch, make_plan, run_records
-from .runner import Record, run_folder
+from .run import EstimatorCell, Plan, Record, add_batch, make_plan, run_folder, run_records
 from .statistics import estimate
-from .study import Study
+from .study import Study, log_folders
 from .tables import Table, write_csv
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
@@ -62,41 +59,13 @@ def plan_of(
 class Comparison:
     """All results, log by log."""
 
-    plan: Plan
-    records: Mapping[str, Record]  # by the cell
+    study: Study
+    results: Sequence[tuple[dict[str, Any], EstimatorCell, Record]]
+    """Log and estimator of each run, its cell and its record."""
+    frame: pd.DataFrame
+    """Tidy row per run and lap, and one per run for the whole log."""
+    has_truth: bool
     folder: Path  # of the files of the runs
-
-    @property
-    def study(self) -> Study:
-        return self.plan.study
-
-    @cached_property
-    def results(self) -> list[tuple[dict[str, Any], EstimatorCell, Record]]:
-        """Names of each run, its cell and its record."""
-        cells = self.plan.cells
-        return [({"log": c.names["track"], "estimator": c.estimator}, c, self.records[c.id]) for c in cells]
-
-    @cached_property
-    def frame(self) -> pd.DataFrame:
-        """Tidy row per run and lap, and one per run for the whole log."""
-        rows: list[dict[str, Any]] = []
-        for names, _, record in self.results:
-            for row in record["rows"]:
-                about = {"scope": "lap" if row["lap"] else "log", "lap": row["lap"] or record["lap_count"]}
-                rows.append({**row, **names, **about})
-        add_batch(rows, ("log",))
-        known = [key for key in METRICS if any(key in row for row in rows)]
-        return pd.DataFrame(rows, columns=["log", "estimator", "scope", "lap", *known])
-
-    @property
-    def times(self) -> pd.DataFrame:
-        """Tidy row per run and stage, in s."""
-        rows = [{**names, **stage} for names, _, one in self.results for stage in one.get("stages", ())]
-        return pd.DataFrame(rows, columns=["log", "estimator", "stage", "mean", "median", "p99", "share"])
-
-    @cached_property
-    def has_truth(self) -> bool:
-        return "rmse" in self.frame or any(has_cones(cell.drive.load()[0].truth) for cell in self.plan.cells)
 
     @property
     def failures(self) -> list[dict[str, Any]]:
@@ -111,7 +80,20 @@ class Comparison:
 
 def compare(plan: Plan, folder: Path, **how: Any) -> Comparison:
     """Run what is missing of a plan in a folder; `how` is that of `run_records`."""
-    return Comparison(plan, run_records(plan, folder, **how), folder)
+    records, rows = run_records(plan, folder, **how), list[dict[str, Any]]()
+    results = [
+        ({"log": cell.drive.track, "estimator": cell.estimator}, cell, records[cell.id])
+        for cell in plan.cells
+    ]
+    for names, _, record in results:
+        for row in record["rows"]:
+            about = {"scope": "lap" if row["lap"] else "log", "lap": row["lap"] or record["lap_count"]}
+            rows.append({**row, **names, **about})
+    add_batch(rows, ("log",))
+    known = [key for key in METRICS if any(key in row for row in rows)]
+    frame = pd.DataFrame(rows, columns=["log", "estimator", "scope", "lap", *known])
+    has_truth = "rmse" in frame or any(has_cones(cell.drive.load()[0].truth) for cell in plan.cells)
+    return Comparison(plan.study, results, frame, has_truth, folder)
 
 
 # --- tables ----------------------------------------------------------------------------------------------
@@ -130,12 +112,12 @@ def paper_frame(comparison: Comparison) -> pd.DataFrame:
 
     An estimator that completed no lap on any log has a row without a lap, of its maps at the end of the logs.
     """
-    keys, rows = [metric.key for metric in PAPER], []
+    rows = []
     for estimator in comparison.study.estimators:
         runs = comparison.frame.query("estimator == @estimator")
         laps = runs[runs["scope"] == "lap"]
         for lap, over_logs in laps.groupby("lap") if len(laps) else [(np.nan, runs)]:
-            found = {key: estimate(over_logs[key]) if key in over_logs else estimate([]) for key in keys}
+            found = {metric.key: estimate(over_logs.get(metric.key, ())) for metric in PAPER}
             means = {key: of.mean for key, of in found.items()}
             halves = {f"{key}_half": of.half for key, of in found.items()}
             rows.append({"estimator": estimator, "lap": lap, "logs": len(over_logs), **means, **halves})
@@ -146,16 +128,13 @@ def paper_table(comparison: Comparison) -> Table:
     """Return the paper's Table 1, lap by lap."""
     found = paper_frame(comparison)
     ends = np.where(found["logs"] > 0, "end", "failed")
-    texts = {
-        "estimator": found["estimator"],
-        "lap": found["lap"].astype("str").where(found["lap"].notna(), ends),
-    }
+    texts = found[["estimator"]].assign(lap=found["lap"].astype("str").where(found["lap"].notna(), ends))
     if len(comparison.study.logs) > 1:
         texts["logs"] = found["logs"].astype("str")
     for metric in PAPER:
         both = zip(found[metric.key], found[f"{metric.key}_half"], strict=True)
         texts[metric.heading] = [metric.text(*pair) for pair in both]
-    return Table(pd.DataFrame(texts), _title(comparison, "at the end of each lap"))
+    return Table(texts, _title(comparison, "at the end of each lap"))
 
 
 def final_table(comparison: Comparison, keys: Sequence[str] = tuple(METRICS)) -> Table:
@@ -195,7 +174,9 @@ def write_comparison(out: Path, comparison: Comparison, jobs: int, *, force: boo
     Each of several logs has a folder of its own. An earlier comparison in `out` is replaced if `force`.
     """
     study = comparison.study
-    frames = {"table": paper_frame(comparison), "metrics": comparison.frame, "times": comparison.times}
+    stages = [{**names, **stage} for names, _, one in comparison.results for stage in one.get("stages", ())]
+    times = pd.DataFrame(stages, columns=["log", "estimator", "stage", "mean", "median", "p99", "share"])
+    frames = {"table": paper_frame(comparison), "metrics": comparison.frame, "times": times}
     with atomic_folder(out, MARKER, force=force) as folder:
         for name, table in tables(comparison).items():
             table.write(folder, name, "md", "tex")

@@ -3,7 +3,7 @@
 import json
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -21,8 +21,7 @@ from .study import Study, find_study, read_study_file
 from .tables import Table, write_csv, write_results
 
 CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
-Values = Mapping[str, Any]  # values of an outcome by name
-COLUMNS: Final = {  # of the table of faults: value and digits
+COLUMNS: Final = {  # of the table of faults: value, and digits
     "runs": ("runs", 0),
     "failed": ("failed", 0),
     "rmse by clean": ("ratio_mean", 2),
@@ -39,10 +38,16 @@ COLUMNS: Final = {  # of the table of faults: value and digits
     "longest time over 1 m off [s]": ("divergence_time", 1),
     "longest way over 1 m off [m]": ("divergence_distance", 0),
 }
-_SAID: Final = ("reported_degraded", "reported_lost")
-_WORST: Final = ("error_max", "divergence_time", "divergence_distance")
-_ENDS: Final = {"closed": "closed_at_end", "lost": "lost_at_end"}
-_MEASURED: Final = ("rmse", "size", "missed", *_SAID, *_WORST, *_ENDS.values())
+MEASURED: Final = {  # value of an outcome: metric, ratio or sign of the runs, and how it is taken over them
+    "with_map": ("ratio", "count"),
+    **{f"ratio_{how}": ("ratio", how) for how in ("mean", "min", "max")},
+    **{name: (name, "mean") for name in ("size_ratio", "missed")},
+    **{"closed": ("closed_at_end", "sum"), "lost": ("lost_at_end", "sum")},
+    **{name: (name, "max") for name in ("error_max", "divergence_time", "divergence_distance")},
+    "reported": ("reported", "sum"),
+    **{name: (name, "mean") for name in ("reported_degraded", "reported_lost")},
+}
+COUNTS: Final = ("with_map", "closed", "lost", "reported")
 _NAME: Final = re.compile(r"(?P<kind>.+): (?P<value>[-+]?\d+(\.\d+)?)( (?P<unit>\S+))?")
 
 
@@ -96,22 +101,12 @@ def outcomes(study: Study, frame: pd.DataFrame) -> list[dict[str, Any]]:
     found = []
     for noise in study.noise:
         fault, runs = fault_of(noise), every[every["noise"] == noise]
+        values: dict[str, Any] = {"fault": fault.kind, "strength": fault.value, "unit": fault.unit}
+        values |= {"runs": len(runs), "failed": int(failures.get(noise, 0))}
+        values |= {name: float(runs[key].agg(how)) for name, (key, how) in MEASURED.items()}
+        values |= {name: int(values[name]) for name in COUNTS}
         sigmas = {key: float(runs[key].astype(float).mean()) for key in runs if key.endswith("_by_prior")}
         titles = {key: METRICS[key].title.removesuffix(" by its prior's sigma") for key in sigmas}
-        values = {
-            **{"fault": fault.kind, "strength": fault.value, "unit": fault.unit},
-            **{
-                "runs": len(runs),
-                "failed": int(failures.get(noise, 0)),
-                "with_map": int(runs["ratio"].count()),
-            },
-            **{f"ratio_{name}": float(runs["ratio"].agg(name)) for name in ("mean", "min", "max")},
-            **{name: float(runs[name].mean()) for name in ("size_ratio", "missed")},
-            **{name: int((runs[key] == 1.0).sum()) for name, key in _ENDS.items()},
-            **{name: float(runs[name].max()) for name in _WORST},
-            "reported": int(runs["reported"].sum()),
-            **{name: float(runs[name].mean()) for name in _SAID},
-        }
         values["calibration"] = {titles[key]: v for key, v in sigmas.items() if abs(v) > PRIOR_LIMIT}
         values["notices"] = dict(Counter(text for text in runs["notices"] if text).most_common())
         found.append(values)
@@ -123,8 +118,9 @@ def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
 
     `ratio` (of rmse) and `size_ratio` are to that run, NaN without a map; `reported`: anything was said.
     """
+    metrics = ["rmse", "size", *(key for key, _ in MEASURED.values() if key in METRICS)]
     last = last_laps(frame)
-    last = last.reindex(columns=[*dict.fromkeys([*last, *_MEASURED])]).astype(dict.fromkeys(_MEASURED, float))
+    last = last.reindex(columns=[*dict.fromkeys([*last, *metrics])]).astype(dict.fromkeys(metrics, float))
     clean = last[last["noise"] == CLEAN].set_index([*RUN])
     own = pd.MultiIndex.from_frame(last[[*RUN]])
     for name, ratio in (("rmse", "ratio"), ("size", "size_ratio")):
@@ -132,14 +128,14 @@ def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     return last.assign(reported=(last["notices"] != "") | (last["reported_lost"] > 0.0))
 
 
-def fault_table(study: Study, found: Sequence[Values], *, notices: bool = False) -> Table:
+def fault_table(study: Study, found: Sequence[dict[str, Any]], *, notices: bool = False) -> Table:
     """Return the cost of each fault relative to the clean run of its track, and how often it is reported.
 
     With `notices` it has what was said as well: calibrations far from their prior (sigmas), and notices.
     """
     rows = []
     for noise, values in zip(study.noise, found, strict=True):
-        shares = {name: values[name] / max(values["runs"], 1) for name in ("closed", "lost", "reported")}
+        shares = {name: values[name] / max(values["runs"], 1) for name in COUNTS}
         known = {**values, **shares}
         cells = [100.0 * known[key] if "%" in title else known[key] for title, (key, _) in COLUMNS.items()]
         row = {"fault": noise}

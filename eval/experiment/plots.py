@@ -1,12 +1,11 @@
 """Maps side by side, and the differences of a study."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pathspace_graph.eval.figures import map_plot, style
@@ -76,7 +75,7 @@ def plot_maps(drawn: Mapping[str, Drawn], truth: Truth | None) -> Figure:
             if number + columns >= len(drawn):
                 axes.set_xlabel("x [m]")
                 axes.tick_params(labelbottom=True)
-        style.grouped_legend(figure)
+        style.shared_legend(figure)
         style.fit_height(figure)
     return figure
 
@@ -98,31 +97,27 @@ def plot_differences(study: Study, frame: pd.DataFrame) -> style.Picture:
         figure = style.Picture(figsize=(WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
         all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
         for axes, panel in zip(all_axes, panels, strict=True):
-            _draw_differences(axes, [panel[i] for i in rows], differ)
+            metric, rng = METRICS[panel[0].metric], np.random.default_rng(0)
+            if differ:
+                axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
+            for row, contrast in enumerate(panel[i] for i in rows):
+                shown = contrast.difference if differ else contrast.value
+                if shown is None or not shown.count:
+                    continue
+                color = BLUE if contrast.significant else GREY
+                pairs = metric.factor * np.array(contrast.differences)
+                scattered = row + rng.uniform(-0.22, 0.22, len(pairs))  # so that they can be seen apart
+                axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=3.5, zorder=2)
+                mean, half = metric.factor * shown.mean, metric.factor * shown.half
+                look: dict[str, Any] = {"color": color, "markersize": 4.5, "elinewidth": 1.0, "zorder": 3}
+                axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", **look)
+            axes.set_title(metric.heading)
+            axes.grid(axis="x")
         all_axes[0].set_yticks(range(len(rows)), [_name(study, panels[0][i]) for i in rows])
         all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
         text = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
         figure.supxlabel(text if differ else "mean and 95 % interval")
     return figure
-
-
-def _draw_differences(axes: Axes, rows: Sequence[Contrast], differ: bool) -> None:
-    metric, rng = METRICS[rows[0].metric], np.random.default_rng(0)
-    if differ:
-        axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
-    for row, contrast in enumerate(rows):
-        shown = contrast.difference if differ else contrast.value
-        if shown is None or not shown.count:
-            continue
-        color = BLUE if contrast.significant else GREY
-        pairs = metric.factor * np.array(contrast.differences)
-        scattered = row + rng.uniform(-0.22, 0.22, len(pairs))  # so that they can be seen apart
-        axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=3.5, zorder=2)
-        mean, half = metric.factor * shown.mean, metric.factor * shown.half
-        look: dict[str, Any] = {"color": color, "markersize": 4.5, "elinewidth": 1.0}
-        axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", zorder=3, **look)
-    axes.set_title(metric.heading)
-    axes.grid(axis="x")
 
 
 def _name(study: Study, contrast: Contrast) -> str:

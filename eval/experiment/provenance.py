@@ -1,6 +1,7 @@
 """What made a result: the sources that it depends on, and the libraries, the commit and the machine."""
 
 import ast
+import json
 import os
 import platform
 import sys
@@ -24,6 +25,11 @@ MEASURED: Final = (  # modules on which every result depends, whatever the estim
 )
 NUMERICS: Final = {name: version(name) for name in ("gtsam", "numpy", "scipy")}
 Code = dict[str, str]  # digest of each source by its module, and version of each library by its name
+
+
+def identity(**parts: Any) -> str:
+    """Return a text that is the same for the same values, which are JSON's types only."""
+    return sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:20]
 
 
 def code_of(estimator: str) -> Code:
@@ -58,7 +64,9 @@ def _code(roots: tuple[str, ...]) -> Code:
             continue
         found[name] = _digest(Path(spec.origin))
         remaining += [(imported, package) for imported in _imports(name)]
-    return dict(sorted(found.items())) | NUMERICS | _library_versions(libraries)
+    known = packages_distributions() if libraries else {}
+    used = {distribution for library in libraries for distribution in known.get(library, [])}
+    return dict(sorted(found.items())) | NUMERICS | {name: version(name) for name in sorted(used)}
 
 
 @cache
@@ -95,24 +103,13 @@ def _imports(name: str) -> tuple[str, ...]:
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             above = package[: len(package) - node.level + 1] if node.level else []
-            found += _imported_from(".".join([*above, *filter(None, [node.module])]), node)
+            base = ".".join([*above, *filter(None, [node.module])])
+            of_base = _spec(base)
+            is_package = of_base is not None and of_base.submodule_search_locations is not None
+            inner = [f"{base}.{alias.name}" for alias in node.names] if is_package else []
+            modules = [one for one in inner if _spec(one) is not None]
+            found += [base] * (len(modules) < len(node.names)) + modules  # the one that has the other names
     return tuple(dict.fromkeys(found))
-
-
-def _imported_from(base: str, node: ast.ImportFrom) -> list[str]:
-    """Return the modules among the names that are imported, and the one that has the others."""
-    spec = _spec(base)
-    if spec is None or spec.submodule_search_locations is None:
-        return [base]
-    inner = [f"{base}.{alias.name}" for alias in node.names]
-    modules = [one for one in inner if _spec(one) is not None]
-    return modules if len(modules) == len(inner) else [base, *modules]
-
-
-def _library_versions(names: set[str]) -> Code:
-    known = packages_distributions() if names else {}
-    distributions = {distribution for name in names for distribution in known.get(name, [])}
-    return {distribution: version(distribution) for distribution in sorted(distributions)}
 
 
 def check_code(module: str, expected: Code, began: str) -> None:
@@ -138,15 +135,12 @@ def here() -> str:
 def made(module: str) -> dict[str, Any]:
     """Return where and when a result of what is in a module is made, and with which libraries."""
     packages = {HOUSE, module.partition(".")[0]}
-    commits = {name: commit for name in sorted(packages) if (commit := commit_of(_folder(name)))}
+    specs = {name: _spec(name) for name in sorted(packages)}
+    folders = {name: Path(spec.origin).parent for name, spec in specs.items() if spec and spec.origin}
+    commits = {name: commit for name, folder in folders.items() if (commit := commit_of(folder))}
     return {
         **versions(),
         "commit": " ".join(commits.values() if len(packages) == 1 else map(" ".join, commits.items())),
         **machine(),
         "date": now(),
     }
-
-
-def _folder(package: str) -> Path | None:
-    spec = _spec(package)
-    return None if spec is None or spec.origin is None else Path(spec.origin).parent

@@ -1,96 +1,338 @@
-"""Studies as they run: cells of estimators and of functions, those that are missing, and one frame of all."""
+"""Studies as they run: cells in parallel, each kept at once, so that a killed one is resumed; one frame."""
 
+import os
+import shutil
+import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property, partial
 from itertools import combinations, product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import joblib
 import numpy as np
 import pandas as pd
+from joblib import Parallel, delayed, parallel_config
+from threadpoolctl import threadpool_limits
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.errors import InputError, OutputError, SolveError
+from pathspace_graph.errors import InputError, OutputError, SettingsError, SolveError, install
 from pathspace_graph.eval.metrics.alignment import aligned_distance
 from pathspace_graph.eval.metrics.measures import measure, online_cycles, stage_times
 from pathspace_graph.eval.metrics.metric import METRICS
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times, summarize, versions
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
-from pathspace_graph.io.files import check_target, to_plain, write_json
+from pathspace_graph.io.files import atomic_folder, check_target, to_plain, write_json, write_text
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.parsing import read_json, shown
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.lengths import times
+from pathspace_graph.loop.worker import end_with
 from pathspace_graph.plausibility.diagnosis import diagnose
 from pathspace_graph.run import run_online, with_own
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import Track
 
-from .drives import AnyDrive, Drive, RecordedDrive, identity, load_tracks, track_digest
-from .provenance import code_from, code_of, here
-from .runner import FILES, Cell, OnCell, Record, locked, run_cells, run_folder, workers
+from .provenance import Code, check_code, code_from, code_of, here, identity, made
 from .statistics import RUN, RUN_OF
-from .study import Study
+from .study import Drive, Study, load_tracks, recorded_drive, simulated_drive, track_digest
 
-FORMAT: Final = "pathspace-study/1"
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+R = TypeVar("R")
+W = TypeVar("W")
+
+CELLS: Final = "cells"  # folder of the kept cells
 STUDY_FILE: Final = "study.json"
+FILES: Final = "files"  # key of the files of a run, on their way from its process
+DIGEST: Final = "digest"  # key of a record's digest in its file
+CELL_FORMAT, STUDY_FORMAT = "pathspace-cell/5", "pathspace-study/1"
+CONNECT_SECONDS: Final = 20.0  # time (s) within which a cluster has to answer
+Record = dict[str, Any]  # what is kept of a cell, in the types of JSON only
+OnCell = Callable[[int, int], None]  # called with the numbers of cells that are done, and of all
 RowsOf = Callable[..., list[dict[str, Any]]]
 
 
-@dataclass(frozen=True, eq=False)
+class WorkerDiedError(RuntimeError):
+    """The process that did the work died."""
+
+
+# --- cells -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cell:
+    """One part of a study, which is run once, in whatever process."""
+
+    work: Callable[[], Record]
+    """What it does; its record has the `rows` that are returned, and other keys."""
+    module: str
+    """Name of the module of what is run."""
+    names: Mapping[str, Any]
+    """Names by which tables and messages know it, in the types of JSON."""
+    meaning: str
+    """Identity of everything that the result depends on, except the code."""
+    code: Code
+    """Code with which the study began."""
+    began: str
+    """Process in which it did."""
+    keep: bool = False
+    """Whether the files of its run are kept beside its record."""
+
+    @cached_property
+    def id(self) -> str:
+        """Identity of everything that the result depends on: cells of one id have one result."""
+        return f"{self.meaning}-{identity(**self.code)[:12]}"
+
+    def record(self) -> Record:
+        """Run it, whatever comes of it; a SettingsError where this process has other code than the study."""
+        check_code(self.module, self.code, self.began)
+        try:
+            with threadpool_limits(limits=1):
+                return self._recorded(self.work())
+        except Exception as error:  # whatever ends a run belongs into the results
+            return self.failed(error)
+
+    def failed(self, error: BaseException) -> Record:
+        """Return the record of a cell that ended with an error."""
+        failure = " ".join(f"{type(error).__name__}: {error}".split())
+        trace = "".join(traceback.format_exception(error))
+        return self._recorded({"failure": failure, "traceback": trace, "rows": []})
+
+    def _recorded(self, found: Record) -> Record:
+        about = {"format": CELL_FORMAT, "id": self.id, "cell": self.names, "made": made(self.module)}
+        return dict(to_plain({**about, "failure": "", "traceback": "", **found}))
+
+
+def run_cells(
+    cells: Sequence[Cell],
+    folder: Path,
+    *,
+    on_cell: OnCell | None = None,
+    retry_failed: bool = False,
+) -> dict[str, Record]:
+    """Run the cells that a folder has no record of, by the `workers`, and return all records by id.
+
+    Cells that mean the same are run once. Each record is kept as soon as it is there.
+    """
+    every = {cell.id: cell for cell in cells}
+    records = {name: known for name, cell in every.items() if (known := read_record(folder, cell))}
+    if retry_failed:
+        records = {name: record for name, record in records.items() if not record["failure"]}
+    remaining = [cell for name, cell in every.items() if name not in records]
+    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    told = on_cell or (lambda *_: None)
+    told(0, len(remaining))
+    for done, (cell, found) in enumerate(outcomes(Cell.record, remaining), start=1):
+        record = cell.failed(found) if isinstance(found, WorkerDiedError) else found
+        record["made"]["command"] = command
+        write_record(folder, cell, record)
+        records[cell.id] = record
+        told(done, len(remaining))
+    return {name: records[name] for name in every}
+
+
+# --- what is kept ------------------------------------------------------------------------------------------
+
+
+def read_record(folder: Path, cell: Cell) -> Record | None:
+    """Return the cell's record in a study's folder, or None if there is none that is as it was written.
+
+    One without the files of its run is none either, where they are to be kept.
+    """
+    try:
+        record = read_json(_file(folder, cell), "a cell")
+    except InputError:
+        return None
+    if not isinstance(record, dict) or record.pop(DIGEST, None) != identity(record=record):
+        return None
+    if (record.get("format"), record.get("id")) != (CELL_FORMAT, cell.id):
+        return None
+    is_missing = cell.keep and not record["failure"] and not run_folder(folder, cell).exists()
+    return None if is_missing else record
+
+
+def write_record(folder: Path, cell: Cell, record: Record) -> None:
+    """Write the record as a file of its own, whole or not at all, after the files of its run."""
+    files = record.pop(FILES, None)
+    if files is not None:
+        with atomic_folder(run_folder(folder, cell), MAP_FILE, force=True) as run:
+            for name, text in files.items():
+                write_text(run / name, text)
+    write_json(_file(folder, cell), {**record, DIGEST: identity(record=record)}, indent=1)
+
+
+def of_other_code(folder: Path, cells: Iterable[Cell]) -> int:
+    """Return the number of kept cells that mean the same as one of these and are of other code."""
+    kept = {tuple(file.stem.split("-")) for file in (folder / CELLS).glob("[!.]*-*.json")}
+    known = {cell.meaning: tuple(cell.id.split("-")) for cell in cells}
+    return sum(known.get(one[0], one) != one for one in kept)
+
+
+def run_folder(folder: Path, cell: Cell) -> Path:
+    """Return the folder of the files of a run in that of its study."""
+    return folder / CELLS / cell.id
+
+
+def _file(folder: Path, cell: Cell) -> Path:
+    return folder / CELLS / f"{cell.id}.json"
+
+
+@contextmanager
+def unfinished(out: Path) -> Iterator[Path]:
+    """Yield a folder beside `out` for the cells of what is not finished, which is gone once it is."""
+    place = Path(os.path.realpath(out))
+    folder = place.with_name(f"{place.name}.unfinished")
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Keep other processes from running a study in a folder; OutputError where one already does.
+
+    The lock of a process ends with it, however it ends. Windows has no such locks.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    if fcntl is None:
+        yield
+        return
+    folder = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise OutputError(f"{out}: expected no study that runs there, found one") from error
+        yield
+    finally:
+        os.close(folder)
+
+
+# --- workers -----------------------------------------------------------------------------------------------
+
+
+def check_jobs(jobs: int) -> None:
+    """Raise SettingsError unless the number of processes is at least 1, or -1."""
+    if jobs < 1 and jobs != -1:
+        raise SettingsError(f"jobs: expected at least 1, or -1 for every core, found {jobs}")
+
+
+@contextmanager
+def workers(jobs: int = 1, cluster: str | None = None) -> Iterator[None]:
+    """Start processes on this machine with one BLAS thread each, or connect to a Dask cluster's workers.
+
+    With one job the work is done by this very process.
+    """
+    check_jobs(jobs)
+    if cluster is None:
+        leave = {"initializer": end_with, "initargs": (os.getpid(),)}
+        with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1, **leave):
+            yield
+        return
+    try:
+        from distributed import Client  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise SettingsError(f"--cluster: expected dask ({install('cluster')}), found none") from error
+    try:
+        client = Client(cluster, timeout=CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"--cluster: expected a Dask scheduler, found none at {cluster}") from error
+    with client, parallel_config(backend="dask", wait_for_workers_timeout=CONNECT_SECONDS):
+        yield
+
+
+def outcomes(work: Callable[[W], R], items: Sequence[W]) -> Iterator[tuple[W, R | WorkerDiedError]]:
+    """Yield (item, work(item)) in the order in which they finish; `work` must not raise.
+
+    When a worker dies, nobody knows which item it had, so each item under way is tried again alone.
+    """
+    remaining, sent = dict(enumerate(items)), list[int]()
+
+    def run(numbers: Iterable[int], **options: Any) -> Iterator[tuple[int, R]]:
+        def tasks() -> Iterator[Any]:
+            for number in numbers:
+                sent.append(number)
+                yield delayed(_numbered)(work, number, remaining[number])
+
+        yield from Parallel(return_as="generator_unordered", batch_size=1, **options)(tasks())
+
+    deaths: tuple[type[Exception], ...] = (BrokenProcessPool,)
+    with suppress(ImportError):
+        from distributed import KilledWorker  # noqa: PLC0415 - an extra
+
+        deaths = (BrokenProcessPool, KilledWorker)
+    while remaining:
+        sent.clear()
+        try:
+            for number, result in run(list(remaining)):
+                yield remaining.pop(number), result
+        except deaths:
+            for number in [number for number in sent if number in remaining]:
+                try:
+                    ((_, again),) = run([number], n_jobs=2)  # one job would be done by this very process
+                except deaths as error:
+                    died = WorkerDiedError(f"the process that ran it died ({type(error).__name__})")
+                    yield remaining.pop(number), died
+                else:
+                    yield remaining.pop(number), again
+
+
+def _numbered(work: Callable[[W], R], number: int, item: W) -> tuple[int, R]:
+    return number, work(item)
+
+
+# --- cells of estimators and of functions ------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class EstimatorCell(Cell):
     """An estimator with settings on the log of a drive."""
 
-    drive: AnyDrive
+    drive: Drive
     estimator: str
+    variant: str
+    """Name of the settings."""
     settings: MapperSettings
-    variant: str  # name of the settings
-    parameters: Any = None  # the estimator's own, a frozen dataclass; None where it has none
+    parameters: Any
+    """Own ones of the estimator, a frozen dataclass; None where it has none."""
 
-    @property
-    def module(self) -> str:
-        return registry.module_of(self.estimator)
 
-    @property
-    def names(self) -> dict[str, Any]:
-        return self.drive.names | {"estimator": self.estimator, "variant": self.variant}
-
-    @cached_property
-    def meaning(self) -> str:
-        known = leaves(self.settings).items()
-        settings = {name: value for name, value in known if registry.reads(self.estimator, name)}
-        own = None if self.parameters is None else to_plain(asdict(self.parameters))
-        return identity(drive=self.drive.id, estimator=self.estimator, settings=settings, own=own)
-
-    def run(self) -> Record:
-        log, hints = self.drive.load()
-        begin, worked = time.perf_counter(), time.thread_time()
-        result = run_estimator(self.estimator, self.settings, log, self.parameters)
-        wall, processor = time.perf_counter() - begin - result.observing, time.thread_time() - worked
-        cycles = online_cycles(result)
-        took = wall, sum(record.processor for record in cycles) if cycles else processor
-        said = [record.notice for record in result.cycles if record.notice]
-        vehicle = result.at_scale_one().vehicle
-        said += [] if vehicle is None else diagnose(vehicle, result.settings)
-        record: Record = {
-            "notices": "; ".join(dict.fromkeys(said)),
-            "lap_count": result.laps,
-            "rows": [{"lap": row.lap, **row.values} for row in measure(result, log, took)],
-            "stages": stage_times(cycles),
-        }
-        if self.keep:  # as texts: a worker may have no disk in common with the study
-            with tempfile.TemporaryDirectory() as place:
-                write_result(Path(place) / "run", result, summarize(result, log, hints))
-                files = (Path(place) / "run").iterdir()
-                record[FILES] = {file.name: file.read_text(encoding="utf-8") for file in files}
-        return record
+def run_on_drive(
+    drive: Drive, estimator: str, settings: MapperSettings, parameters: Any, keep: bool
+) -> Record:
+    """Run an estimator on a log, and return its metrics and, with `keep`, its files."""
+    log, hints = drive.load()
+    begin, worked = time.perf_counter(), time.thread_time()
+    result = run_estimator(estimator, settings, log, parameters)
+    wall, processor = time.perf_counter() - begin - result.observing, time.thread_time() - worked
+    cycles = online_cycles(result)
+    took = wall, sum(record.processor for record in cycles) if cycles else processor
+    said = [record.notice for record in result.cycles if record.notice]
+    vehicle = result.at_scale_one().vehicle
+    said += [] if vehicle is None else diagnose(vehicle, result.settings)
+    record: Record = {
+        "notices": "; ".join(dict.fromkeys(said)),
+        "lap_count": result.laps,
+        "rows": measure(result, log, took),
+        "stages": stage_times(cycles),
+    }
+    if keep:  # as texts: a worker may have no disk in common with the study
+        with tempfile.TemporaryDirectory() as place:
+            write_result(Path(place) / "run", result, summarize(result, log, hints))
+            files = (Path(place) / "run").iterdir()
+            record[FILES] = {file.name: file.read_text(encoding="utf-8") for file in files}
+    return record
 
 
 def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> RunResult:
@@ -104,31 +346,6 @@ def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any
     return with_own(result, parameters)
 
 
-@dataclass(frozen=True, eq=False)
-class RowsCell(Cell):
-    """A function with the arguments that its rows depend on."""
-
-    function: RowsOf
-    arguments: Mapping[str, Any]
-    others: Mapping[str, Any] = field(default_factory=dict)  # arguments that change no row
-    depends: Any = None  # on what its rows depend beside the arguments and its code
-
-    @property
-    def module(self) -> str:
-        return str(self.function.__module__)
-
-    @property
-    def names(self) -> dict[str, Any]:
-        return {name: value for name, value in self.arguments.items() if isinstance(value, str | int | float)}
-
-    @cached_property
-    def meaning(self) -> str:
-        return str(joblib.hash([self.function.__qualname__, dict(self.arguments), self.depends]))
-
-    def run(self) -> Record:
-        return {"rows": self.function(**self.arguments, **self.others)}
-
-
 def rows_of(
     function: RowsOf,
     arguments: Iterable[Mapping[str, Any]],
@@ -136,14 +353,21 @@ def rows_of(
     *,
     jobs: int = 1,
     on_cell: OnCell | None = None,
-    **more: Any,
+    others: Mapping[str, Any] | None = None,
+    depends: Any = None,
 ) -> pd.DataFrame:
     """Return the rows of a function of a module for each of some arguments; SolveError where one fails.
 
-    With a `folder` they are kept there, so that a study that was killed goes on. `more` is for the cells.
+    With a `folder` they are kept there, so that a study that was killed goes on. `others` are arguments that
+    change no row; `depends` is what the rows depend on beside the arguments and the code of the module.
     """
-    code, began = code_from(function.__module__), here()
-    cells = [RowsCell(function, of, code=code, began=began, **more) for of in arguments]
+    code, module, cells = code_from(function.__module__), function.__module__, list[Cell]()
+    for of in arguments:
+        names = {name: value for name, value in of.items() if isinstance(value, str | int | float)}
+        meaning = str(joblib.hash([function.__qualname__, dict(of), depends]))
+        work = partial(_rows, function, {**of, **(others or {})})
+        about: dict[str, Any] = {"module": module, "code": code, "began": here()}
+        cells.append(Cell(work=work, names=names, meaning=meaning, **about))
     with tempfile.TemporaryDirectory() if folder is None else nullcontext(folder) as place, workers(jobs):
         records = run_cells(cells, Path(place), on_cell=on_cell, retry_failed=True)
     for cell in cells:
@@ -151,6 +375,10 @@ def rows_of(
             raise SolveError(f"{', '.join(map(str, cell.names.values()))}: {failure}")
     rows = [row for cell in cells for row in records[cell.id]["rows"]]
     return pd.DataFrame([{k: np.nan if v is None else v for k, v in row.items()} for row in rows])
+
+
+def _rows(function: RowsOf, arguments: Mapping[str, Any]) -> Record:
+    return {"rows": function(**arguments)}
 
 
 # --- studies ---------------------------------------------------------------------------------------------
@@ -169,7 +397,7 @@ class Plan:
         study = self.study
         same = ("name", "question", "seeds", "laps", "estimators", "varied", "metrics")
         return {
-            "format": FORMAT,
+            "format": STUDY_FORMAT,
             **{name: getattr(study, name) for name in same},
             "tracks": [{"name": track.name, "digest": track_digest(track)} for track in self.tracks],
             "logs": {track: [folder.name for folder in folders] for track, folders in study.logs.items()},
@@ -194,26 +422,35 @@ def make_plan(study: Study, *, keep: bool = False) -> Plan:
     tracks, points = tuple(load_tracks(study.tracks)), study.points
     for name, variant in product(study.estimators, points.values()):
         registry.check_estimator(name, variant.settings, dict(variant.parameters).get(name))
-    code, began = {name: code_of(name) for name in study.estimators}, here()
-    drives: list[AnyDrive] = [
-        Drive(track, seed, noise, study.simulation(noise))
+    drives = [
+        simulated_drive(track, seed, noise, study.simulation(noise))
         for noise, track, seed in product(study.noise, tracks, study.seeds)
     ]
     for track, folders in study.logs.items():
         limits = study.settings.limits
-        drives += [RecordedDrive(track, number, folder, limits) for number, folder in enumerate(folders)]
-    cells = tuple(
-        EstimatorCell(
-            *(drive, estimator, variant.settings, name),
-            parameters=dict(variant.parameters).get(estimator),
-            keep=keep,
+        drives += [recorded_drive(track, number, folder, limits) for number, folder in enumerate(folders)]
+    code, cells = {name: code_of(name) for name in study.estimators}, list[EstimatorCell]()
+    for drive, estimator, (name, variant) in product(drives, study.estimators, points.items()):
+        settings, parameters = variant.settings, dict(variant.parameters).get(estimator)
+        read = {k: v for k, v in leaves(settings).items() if registry.reads(estimator, k)}
+        own = None if parameters is None else to_plain(asdict(parameters))
+        cell = EstimatorCell(
+            work=partial(run_on_drive, drive, estimator, settings, parameters, keep),
+            module=registry.module_of(estimator),
+            names={"track": drive.track, "seed": drive.seed, "noise": drive.noise}
+            | {"estimator": estimator, "variant": name},
+            meaning=identity(drive=drive.id, estimator=estimator, settings=read, own=own),
             code=code[estimator],
-            began=began,
+            began=here(),
+            keep=keep,
+            drive=drive,
+            estimator=estimator,
+            variant=name,
+            settings=settings,
+            parameters=parameters,
         )
-        for drive in drives
-        for estimator, (name, variant) in product(study.estimators, points.items())
-    )
-    return Plan(study, tracks, cells)
+        cells.append(cell)
+    return Plan(study, tracks, tuple(cells))
 
 
 def run_study(study: Study, out: Path | str | None = None, *, keep: bool = False, **how: Any) -> pd.DataFrame:
@@ -266,7 +503,7 @@ def add_agreement(out: Path, cells: Sequence[EstimatorCell], records: Mapping[st
     """Add how far each kept map of a recorded log is from those of the other logs of its track (m)."""
     maps = dict[tuple[Any, ...], dict[str, Map]]()
     for cell in cells:
-        if isinstance(cell.drive, RecordedDrive) and (run_folder(out, cell) / MAP_FILE).exists():
+        if cell.drive.simulation is None and (run_folder(out, cell) / MAP_FILE).exists():
             key = (cell.drive.track, cell.estimator, cell.settings, cell.parameters)
             maps.setdefault(key, {})[cell.id] = read_map(run_folder(out, cell))
     for alike in maps.values():
@@ -287,15 +524,13 @@ def frame_of(study: Study, cells: Sequence[tuple[EstimatorCell, Record]]) -> pd.
     """
     rows = list[dict[str, Any]]()
     for cell, record in cells:
-        shared = {"study": study.name} | cell.names | _settings_row(study, cell)
+        shared = {"study": study.name, **cell.names} | _settings_row(study, cell)
         about = {"failure": record["failure"], "notices": record.get("notices", ""), **record["made"]}
         about |= {"drive": cell.drive.source, "cell": cell.id}
-        if not record["rows"]:
-            rows.append(shared | {"lap": None} | about)
-            continue
-        *laps, whole = record["rows"]
-        of_run = {key: value for key, value in whole.items() if key != "lap" and METRICS[key].scope == "run"}
-        rows += [shared | lap | of_run | about for lap in laps or [whole | {"lap": 1}]]
+        *laps, whole = record["rows"] or [{}]
+        of_run = {k: v for k, v in whole.items() if k in METRICS and METRICS[k].scope == "run"}
+        laps = laps or [whole | {"lap": 1 if whole else None}]
+        rows += [shared | lap | of_run | about for lap in laps]
     add_batch(rows, (*RUN, "noise", "variant"))
     settings = _settings_row(study, cells[0][0])
     order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "notices", *versions(), "drive", "cell"]

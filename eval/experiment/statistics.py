@@ -19,9 +19,7 @@ RUN: Final = ("track", "seed")  # columns of a drive; combinations are paired on
 RUN_OF: Final = (*RUN, *COMBINATION)
 TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
 LEVEL: Final = 0.95  # confidence level of intervals; a difference is significant if p < 1 - LEVEL
-RESAMPLES: Final = 2000
 ROUND_OFF: Final = 1e-12  # share of differences below which they are all the same
-FEWEST: Final = 8  # samples that can be resampled: fewer have too few different resamples
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,26 +45,14 @@ def by_track(values: pd.Series) -> pd.Series:
 
 
 def estimate(values: ArrayLike) -> Estimate:
-    """Return the mean m of the known ones of independent values (n,) and its interval m -+ q s / sqrt(n).
-
-    From `FEWEST` values on, q is the quantile of `|m* - m| sqrt(n) / s*` over resamples with replacement (the
-    bootstrap-t, which covers skewed values better than Student's t); below, it is Student's. The plain
-    percentiles of m* would cover the mean of five normal values in 84 % of the cases only. Half an
-    interval by resamples is at most the range of the values: s* is tiny in resamples without an outlier.
-    """
+    """Return the mean m of independent values (n,) that are known, and Student's `m -+ t s / sqrt(n)`."""
     known = np.asarray(values, float)
     known = known[np.isfinite(known)]
     n = len(known)
     if n < 2:
         return Estimate(float(known[0]) if n else float("nan"), float("nan"), n)
-    mean, sem = float(np.mean(known)), float(np.std(known, ddof=1) / n**0.5)
-    quantile = float(stats.t.ppf(0.5 + LEVEL / 2, n - 1))
-    if n >= FEWEST and sem > 0.0:
-        drawn = known[np.random.default_rng(0).integers(0, n, (RESAMPLES, n))]
-        off, spread = np.abs(drawn.mean(axis=1) - mean), drawn.std(axis=1, ddof=1) / n**0.5
-        quantile = float(np.quantile(off[spread > 0.0] / spread[spread > 0.0], LEVEL))
-        quantile = min(quantile, float(np.ptp(known)) / sem)
-    return Estimate(mean, quantile * sem, n)
+    half = stats.t.ppf(0.5 + LEVEL / 2, n - 1) * stats.sem(known)
+    return Estimate(float(np.mean(known)), float(half), n)
 
 
 def paired_p(differences: Array) -> float:

@@ -1,27 +1,150 @@
-"""Studies: the tracks, seeds, noise, estimators and settings to compare, as a TOML file or in Python."""
+"""Studies: drives, estimators and settings to compare, from a TOML file or in Python."""
 
+import hashlib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError, check_name
 from pathspace_graph.eval.metrics.metric import METRICS
+from pathspace_graph.io.files import is_temporary
+from pathspace_graph.io.log import FILES, LOG_FILE, Log
 from pathspace_graph.io.overrides import Overrides, apart, flatten, override
 from pathspace_graph.io.parsing import MAX_HEADER_BYTES, MAX_VARIANTS, parse_toml, read_text, shown
+from pathspace_graph.plausibility.hint import Hint
+from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset
+from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset, simulate
+from pathspace_graph.sim.track import EVENTS, Track
+from pathspace_graph.sim.track_files import read_track
+from pathspace_graph.sim.track_generator import generate_track
 
-from .drives import RECORDED, log_folders
+from .provenance import identity
 
 SHIPPED: Final = Path(__file__).parents[1] / "studies"
 DEFAULT: Final = "default"  # variant that overrides nothing, part of every study
 PRESET: Final = "preset"  # entry of a noise that names a preset, as in `sensor.preset = "camera"`
 ALL: Final = "all"  # name that stands for all known estimators
+RECORDED: Final = "recorded"  # noise of a drive that was not simulated
+TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
+RESOLUTION: Final = 1e-3  # length (m) and angle (rad) to which the geometry of a track identifies it
+ROUNDING: Final = 1.0 / np.pi  # shift that keeps coordinates of few decimals off the edges of millimetres
 _LISTS: Final = ("tracks", "seeds", "estimators", "metrics")
+_latest: dict[str, tuple[Log, Sequence[Hint]]] = {}  # the log that was asked for last, by its drive
+
+
+# --- drives ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A log that is simulated or recorded, as a study names it."""
+
+    track: str
+    seed: int
+    """Number of the drive on its track."""
+    noise: str
+    source: str
+    """Seed with which `simulate` makes the same log, or the name of the recorded one."""
+    id: str
+    """Identity of everything that the log depends on, except the code."""
+    read: Callable[[], tuple[Log, Sequence[Hint]]]
+    simulation: SimulationSettings | None = None
+
+    def load(self) -> tuple[Log, Sequence[Hint]]:
+        """Return the log and its likely mistakes; the latest one is kept, for cells in order of drives."""
+        if self.id not in _latest:
+            _latest.clear()
+            _latest[self.id] = self.read()
+        return _latest[self.id]
+
+
+def simulated_drive(track: Track, seed: int, noise: str, simulation: SimulationSettings) -> Drive:
+    """Return a drive whose seed depends on the track: those of several tracks are independent samples."""
+    digest = track_digest(track)
+    own = int(identity(track=digest, seed=seed)[:8], 16)
+    meaning = identity(track=digest, seed=own, simulation=asdict(simulation))
+    read = partial(_simulated, track, simulation, own)
+    return Drive(track.name, seed, noise, str(own), meaning, read, simulation)
+
+
+def _simulated(track: Track, simulation: SimulationSettings, seed: int) -> tuple[Log, Sequence[Hint]]:
+    return simulate(track, simulation, seed), ()
+
+
+def recorded_drive(track: str, number: int, folder: Path, limits: LimitSettings) -> Drive:
+    """Return the drive of a log's folder, one of those that were driven on a track."""
+    digest = hashlib.sha256()
+    for file in (folder / name for name in FILES):
+        digest.update(file.name.encode() + (file.read_bytes() if file.exists() else b""))
+    read = partial(read_plausible_log, folder, limits)
+    return Drive(track, number, RECORDED, folder.resolve().name, digest.hexdigest()[:20], read)
+
+
+def track_digest(track: Track) -> str:
+    """Return the identity of a track's geometry to the millimetre, wherever it came from.
+
+    The last digits of a generated track depend on the processor; the seeds of its drives do not.
+    """
+    parts = (track.left, track.right, track.other, track.start, track.cone_labels)
+    rounded = (np.floor(np.asarray(part) / RESOLUTION + ROUNDING).astype("<i8") for part in parts)
+    cones = b"|".join(part.tobytes() for part in rounded)
+    return hashlib.sha256(cones + str(track.closed).encode()).hexdigest()[:20]
+
+
+def log_folders(folder: Path) -> dict[str, Path]:
+    """Return a log's folder by its name, or those in a folder of logs; InputError if there is none."""
+    folders = {folder.resolve().name: folder}
+    if not (folder / LOG_FILE).exists():
+        entries = sorted(folder.iterdir()) if folder.is_dir() else []
+        folders = {e.name: e for e in entries if not is_temporary(e.name) and (e / LOG_FILE).is_file()}
+    if not folders:
+        raise InputError(folder, f"expected a log ({LOG_FILE}) or folders that are logs, found neither")
+    return folders
+
+
+def load_tracks(tracks: Iterable[Path | int]) -> list[Track]:
+    """Read or generate tracks, with the names that they have in the results.
+
+    A folder stands for every track file in it, a number is the seed of a generated track, and the name of an
+    event stands for its track. InputError where a file is no track or a folder has none.
+    """
+    every = list[Path | int]()
+    for entry in tracks:
+        if not isinstance(entry, Path) or not entry.is_dir():
+            every.append(entry)
+        elif files := sorted(file for file in entry.iterdir() if file.suffix in TRACK_SUFFIXES):
+            every += files
+        else:
+            raise InputError(entry, f"expected track files ({', '.join(TRACK_SUFFIXES)}), found none")
+    stems = [track.stem for track in every if isinstance(track, Path)]
+    return [_load(track, stems) for track in every]
+
+
+def _load(track: Path | int, stems: list[str]) -> Track:
+    if isinstance(track, int):
+        return replace(generate_track(np.random.default_rng(track)), name=f"generated {track}")
+    if track.name in EVENTS and not track.exists():
+        return EVENTS[track.name]()
+    if not track.exists() and track.parent.is_dir():
+        beside = sorted(entry.name for entry in track.parent.iterdir() if entry.suffix == track.suffix)
+        try:
+            check_name(track.name, beside, "expected a track file")
+        except SettingsError as error:
+            raise InputError(track, str(error)) from error
+    folder = f"{track.resolve().parent.name}/" if stems.count(track.stem) > 1 else ""
+    return replace(read_track(track), name=f"{folder}{track.stem}")
+
+
+# --- studies -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -83,8 +206,6 @@ class Study:
         if self.estimators == (ALL,):
             object.__setattr__(self, "estimators", tuple(registry.known_estimators()))
         self._check_lists()
-        if type(self.laps) is not int:
-            raise SettingsError(f"laps: expected a whole number, found {shown(self.laps)}")
         if DEFAULT in self.variants:
             raise SettingsError(f"variants.{DEFAULT}: that name is kept for the settings as they are")
         for name in self.noise:
@@ -100,18 +221,17 @@ class Study:
         if not self.tracks and not self.logs:
             expected = "track files, or seeds of generated tracks"
             raise SettingsError(f"tracks: expected at least one of {expected}, or drives.logs, found none")
-        for name in ("tracks", "seeds", "estimators", "noise", "metrics"):
-            values = getattr(self, name)
-            if (len(values) == 0 and name != "tracks") or len({repr(value) for value in values}) != len(
-                values
-            ):
+        for name in (*_LISTS, "noise"):
+            values = [*getattr(self, name)]
+            if (not values and name != "tracks") or len({*map(repr, values)}) < len(values):
                 expected = "expected at least one, and none twice"
-                raise SettingsError(f"{name}: {expected}, found {shown(list(values))}")
-        generated = [track for track in self.tracks if not isinstance(track, Path)]
-        for name, values in {"seeds": self.seeds, "tracks": generated}.items():
-            for value in values:
-                if type(value) is not int or value < 0:
+                raise SettingsError(f"{name}: {expected}, found {shown(values)}")
+        for name, numbers in {"seeds": self.seeds, "tracks": self.tracks}.items():
+            for value in numbers:
+                if not isinstance(value, Path) and (type(value) is not int or value < 0):
                     raise SettingsError(f"{name}: expected whole numbers from 0 on, found {shown(value)}")
+        if type(self.laps) is not int:
+            raise SettingsError(f"laps: expected a whole number, found {shown(self.laps)}")
         for name in self.estimators:
             check_name(name, registry.known_estimators(), "estimators: expected a known estimator")
         for name in self.metrics:
@@ -222,51 +342,51 @@ def read_study_file(file: Path | str) -> Study:
         raise InputError(file, str(error)) from error
 
 
+_KINDS: Final[Mapping[str, type]] = {  # types of the keys of a study's file
+    **dict.fromkeys(("name", "question"), str),
+    **dict.fromkeys(_LISTS, list),
+    **dict.fromkeys(("drives", "settings", "noise", "variants", "baseline"), Mapping),
+    **dict.fromkeys(("laps", "grid"), object),
+}
+
+
 def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "study") -> Study:
-    renamed = {"grids": "grid", "logs": "drives"}
-    known = {renamed.get(entry.name, entry.name) for entry in fields(Study)} - {"own"}
-    for key in content:
-        check_name(key, known, "expected a known key")
-    values: dict[str, Any] = {"name": name} | dict(content)
-    for key in (key for key in _LISTS if key in values):
-        values[key] = (ALL,) if values[key] == ALL else tuple(_typed(key, values[key], list))
-    for key in ("name", "question"):
-        _typed(key, values.get(key, ""), str)
-    values["tracks"] = tuple(folder / t if isinstance(t, str) else t for t in values.get("tracks", ()))
-    if "drives" in values:
-        values["logs"] = _logs(_typed("drives", values.pop("drives"), Mapping), folder)
-    if "settings" in values:
-        given = flatten(_typed("settings", values["settings"], Mapping))
-        overrides, values["own"] = apart(given, registry.known_estimators(), MapperSettings())
-        values["settings"] = override(MapperSettings(), overrides, "settings")
-    for key in (key for key in ("noise", "variants") if key in values):
-        tables = _typed(key, values[key], Mapping).items()
-        values[key] = {k: flatten(_typed(f"{key}.{k}", v, Mapping)) for k, v in tables}
-    if "grid" in values:
-        grids = values.pop("grid")
-        grids = grids if isinstance(grids, list) else [grids]
-        values["grids"] = tuple(flatten(_typed("grid", grid, Mapping)) for grid in grids)
-    if "baseline" in values:
-        for key, value in _typed("baseline", values["baseline"], Mapping).items():
-            check_name(key, ("variant", "estimator"), "baseline: expected a known key")
-            _typed(f"baseline.{key}", value, str)
-        values["baseline"] = Baseline(**values["baseline"])
-    return Study(**values)
+    """Return the study of a file's content; SettingsError names the key that is wrong."""
+    values: dict[str, Any] = {"name": name}
+    for key, given in content.items():
+        check_name(key, _KINDS, "expected a known key")
+        values[key] = _typed(key, [ALL] if given == ALL and key in _LISTS else given, _KINDS[key])
+    values["tracks"] = [folder / t if isinstance(t, str) else t for t in values.get("tracks", ())]
+    values["logs"] = _logs(values.pop("drives", {}), folder)
+    given = flatten(values.get("settings", {}))
+    overrides, values["own"] = apart(given, registry.known_estimators(), MapperSettings())
+    values["settings"] = override(MapperSettings(), overrides, "settings")
+    for key in {"noise", "variants"} & set(values):
+        tables = values[key].items()
+        values[key] = {k: flatten(_typed(f"{key}.{k}", table, Mapping)) for k, table in tables}
+    grids = values.pop("grid", [])
+    grids = grids if isinstance(grids, list) else [grids]
+    values["grids"] = [flatten(_typed("grid", grid, Mapping)) for grid in grids]
+    baseline = values.get("baseline", {})
+    for key, value in baseline.items():
+        check_name(key, ("variant", "estimator"), "baseline: expected a known key")
+        _typed(f"baseline.{key}", value, str)
+    return Study(**values | {"baseline": Baseline(**baseline)})
 
 
 def _logs(drives: Mapping[str, Any], folder: Path) -> dict[str, tuple[Path, ...]]:
     """Return logs by their track: from a list, each of a track of its own, or from a table of lists."""
+
+    def paths(key: str, values: Any) -> tuple[Path, ...]:
+        given = [folder / _typed(key, value, str) for value in _typed(key, values, list)]
+        return tuple(log for path in given for log in log_folders(path).values())
+
     for key in drives:
         check_name(key, ("logs",), "drives: expected a known key")
     logs = drives.get("logs", [])
     if isinstance(logs, Mapping):
-        return {track: _paths(f"drives.logs.{track}", own, folder) for track, own in logs.items()}
-    return {path.name: (path,) for path in _paths("drives.logs", logs, folder)}
-
-
-def _paths(key: str, values: Any, folder: Path) -> tuple[Path, ...]:
-    every = [folder / _typed(key, value, str) for value in _typed(key, values, list)]
-    return tuple(path for given in every for path in log_folders(given).values())
+        return {track: paths(f"drives.logs.{track}", own) for track, own in logs.items()}
+    return {log.name: (log,) for log in paths("drives.logs", logs)}
 
 
 def _typed(key: str, value: Any, kind: type) -> Any:

@@ -12,13 +12,12 @@ from rich.text import Text
 from tabulate import LATEX_ESCAPE_RULES
 
 from pathspace_graph.eval.figures.style import save_figures
-from pathspace_graph.eval.metrics.metric import HIGHER, LOWER, METRICS, UNKNOWN, Metric, figure
+from pathspace_graph.eval.metrics.metric import METRICS, UNKNOWN, Metric, figure
 from pathspace_graph.io.files import replacing, write_text
 
 from .plots import plot_differences
 from .statistics import (
     COMBINATION,
-    FEWEST,
     LEVEL,
     RUN,
     RUN_OF,
@@ -127,15 +126,9 @@ def by_metric(parts: Mapping[str, pd.DataFrame], keys: Sequence[str]) -> Table:
 
 def by_name(frame: pd.DataFrame, names: Sequence[str], keys: Sequence[str]) -> Table:
     """Return the last laps of the runs, with a row for each value of the columns `names`."""
-    parts = parts_of(frame, names).items()
-    rows = ((label, *(mean(key, runs) for key in keys)) for label, runs in parts)
-    return Table.of((", ".join(names), *(METRICS[key].heading for key in keys)), rows)
-
-
-def parts_of(frame: pd.DataFrame, names: Sequence[str]) -> dict[str, pd.DataFrame]:
-    """Return the last lap of each run, by the values of some columns."""
     groups = last_laps(frame).groupby([*names], sort=False)
-    return {", ".join(map(str, values)): runs for values, runs in groups}
+    rows = ((", ".join(map(str, of)), *(mean(key, runs) for key in keys)) for of, runs in groups)
+    return Table.of((", ".join(names), *(METRICS[key].heading for key in keys)), rows)
 
 
 # --- tables of studies -----------------------------------------------------------------------------------
@@ -160,13 +153,14 @@ def results_table(
         column = contrasts(study, frame, metric.key)
         rows |= {name: [getattr(one, name) for one in column] for name in names}
         rows[metric.heading] = [_mean(metric, one.value) for one in column]
-        sign = (metric.key in LOWER) - (metric.key in HIGHER)
+        sign = (metric.best == "least") - (metric.best == "most")
         means = pd.Series([sign * one.value.mean for one in column])
         of_noise = means.groupby([one.noise for one in column])
         differs = (of_noise.transform("nunique") > 1) & bool(sign)
         best[metric.heading] = (differs & (means == of_noise.transform("min"))).tolist()
     texts = pd.DataFrame(rows)
-    title = f"{_about(study)} Mean and {_interval(frame)}{_laps(study)}."
+    laps = f", at the end of the last of {study.laps} laps" if study.tracks else ""
+    title = f"{f'{study.name}: {study.question}'.strip()} Mean and {_interval(frame)}{laps}."
     bold = pd.DataFrame(best).reindex(columns=texts.columns, fill_value=False)
     return Table(texts, title, len(names), label, bold)
 
@@ -225,31 +219,22 @@ def _p(p: float) -> str:
     return "" if np.isnan(p) else f"{p:.3f}" if p >= 0.001 else "<0.001"
 
 
-def _about(study: Study) -> str:
-    return f"{study.name}: {study.question}".strip()
-
-
-def _laps(study: Study) -> str:
-    return f", at the end of the last of {study.laps} laps" if study.tracks else ""
-
-
 def _interval(frame: pd.DataFrame) -> str:
     """Return which interval stands beside a mean, and over what."""
     tracks = frame["track"].nunique()
     over = f"{tracks} tracks, each the mean of its drives" if tracks > 1 else "the drives of one track"
-    samples = tracks if tracks > 1 else len(frame.groupby([*RUN]))
-    kind = "bootstrap-t" if samples >= FEWEST else "Student's t"
-    return f"{100 * LEVEL:g} % interval ({kind}) over {over}"
+    return f"{100 * LEVEL:g} % interval (Student's t) over {over}"
 
 
 def caption(study: Study, frame: pd.DataFrame) -> str:
     """Return what the tables show, and how it was tested."""
-    base = study.baseline
-    against = f"{base.estimator}: {study.baseline_variant}" if base.estimator else study.baseline_variant
+    base, name = study.baseline, study.baseline_variant
+    against = f"{base.estimator}: {name}" if base.estimator else name
     runs = frame.groupby(list(RUN_OF), sort=False)["failure"].first()
+    laps = f", at the end of the last of {study.laps} laps" if study.tracks else ""
     return (
-        f"{_about(study)} "
-        f"{len(runs)} runs ({int((runs != '').sum())} failed){_laps(study)}. "
+        f"{f'{study.name}: {study.question}'.strip()} "
+        f"{len(runs)} runs ({int((runs != '').sum())} failed){laps}. "
         f"Mean and {_interval(frame)}; difference from {against} in the "
         f"same drives; p of the paired t-test over them, corrected by Holm's method over all comparisons of "
         f"the metric that differ at all, and p of Wilcoxon's signed-rank test, not corrected; * where p < "

@@ -62,7 +62,9 @@ def plot_map(
         for label, boundary in sorted(track.boundaries.items()):
             draw_boundary(axes, boundary, label, band_scale)
         for label, cones in sorted(track.points.items()):
-            draw_orange(axes, cones.points, label)
+            size = (2.0 if label == BIG_ORANGE else 1.2) * LANDMARK_SIZE
+            text = f"{NAMES[label].replace('_', ' ')} cones"
+            style.draw_points(axes, cones.points, "^", RED, text, markersize=size, zorder=4.5)
         if len(differences):
             places = np.array(differences)
             style.draw_points(axes, places, "x", PURPLE, "not as the known map", markersize=5.0, zorder=4.6)
@@ -101,13 +103,6 @@ def draw_boundary(axes: Axes, boundary: MapBoundary, label: int, band_scale: flo
     squares: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 0.6, "zorder": 5}
     points, text = spline.distinct_control_points, f"{name} control points"
     style.draw_points(axes, points, "s", color, text, **squares)
-
-
-def draw_orange(axes: Axes, points: Array, label: int) -> None:
-    """Draw orange cones (n, 2) as triangles, those of gates larger, map frame (m)."""
-    size = (2.0 if label == BIG_ORANGE else 1.2) * LANDMARK_SIZE
-    name = NAMES[label].replace("_", " ")
-    style.draw_points(axes, points, "^", RED, f"{name} cones", markersize=size, zorder=4.5)
 
 
 def draw_trajectory(
@@ -151,7 +146,7 @@ def finish(figure: Figure, axes: Axes, title: str | None) -> None:
     low, high = drawn[:, 0] - MARGIN, drawn[:, 1] + MARGIN
     style.set_frame(axes, low, high)
     axes.set(xlabel="x [m]", ylabel="y [m]", title=title or "")
-    style.grouped_legend(figure)
+    style.shared_legend(figure)
     width, height = high - low
     figure.set_size_inches(WIDTH, min(7.5, WIDTH * height / width + 0.85))
 

@@ -1,6 +1,6 @@
 """How all figures look: sizes, colours, legends, the marks they are drawn with, and their files."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BytesIO
 from math import ceil
@@ -11,10 +11,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
@@ -84,38 +82,16 @@ def set_frame(axes: Axes, low: Array, high: Array) -> None:
     axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
 
 
-def label_logarithms(axes: Axes) -> None:
-    """Label 1, 2 and 5 of every decade of a logarithmic y axis."""
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def shared_legend(figure: Figure, columns: int = 1) -> None:
-    """Add one legend for all panels, below them, with each entry once."""
-    entries = _entries(figure.axes)
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns)
-
-
-def grouped_legend(figure: Figure) -> None:
-    """Add a legend below all panels: a column for the left boundary, one for the right, then the rest."""
-    entries, names = _entries(figure.axes), tuple(NAMES[label] for label in BOUNDARIES)
-    sides = [[label for label in entries if label.startswith(side)] for side in names]
-    rest = [label for label in entries if not label.startswith(names)]
-    rows = max(1, ceil(len(rest) / 3), *(len(side) for side in sides))
-    columns = [*(side for side in sides if side), *(rest[i : i + rows] for i in range(0, len(rest), rows))]
-    padded = [label for column in columns for label in column + [""] * (rows - len(column))]
-    blank = Line2D([], [], linestyle="none")
-    handles = [entries.get(label, blank) for label in padded]
-    figure.legend(handles, padded, loc="outside lower center", ncols=max(len(columns), 1))
-
-
-def _entries(panels: Iterable[Axes]) -> dict[str, Any]:
+def shared_legend(figure: Figure) -> None:
+    """Add one legend for all panels below them, of three rows: the left boundary, the right one, the rest."""
     entries: dict[str, Any] = {}
-    for axes in panels:
+    for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    return entries
+    sides = [NAMES[label] for label in BOUNDARIES]
+    names = sorted(entries, key=lambda label: [not label.startswith(side) for side in sides])
+    handles, columns = [entries[name] for name in names], max(ceil(len(names) / 3), 1)
+    figure.legend(handles, names, loc="outside lower center", ncols=columns)
 
 
 def fit_height(figure: Figure) -> None:
@@ -144,13 +120,6 @@ def uncertainty_band(boundary: SplineBoundary, u: Array, scale: float = 1.0) -> 
     offsets = half[:, None] * spline.normal_unit(u)
     centre = spline.evaluate(u)
     return centre + offsets, centre - offsets
-
-
-def point_blocks(covariance: Array) -> Array:
-    """Return each point's covariance (m, 2, 2) from the joint one (2m, 2m) over x0, y0, x1, y1 and so on."""
-    m = len(covariance) // 2
-    index = np.arange(m)
-    return np.asarray(covariance.reshape(m, 2, m, 2)[index, :, index, :])
 
 
 def draw_curve(
@@ -200,7 +169,9 @@ def ellipse_outlines(points: Array, joint: Array, scale: float = 1.0) -> Array:
 
     The joint covariance (2m, 2m) is over x0, y0, x1, y1 and so on.
     """
-    variances, vectors = np.linalg.eigh(point_blocks(joint))
+    m = np.arange(len(points))
+    blocks = joint.reshape(len(points), 2, len(points), 2)[m, :, m, :]  # covariance of each point (m, 2, 2)
+    variances, vectors = np.linalg.eigh(blocks)
     angles = np.linspace(0.0, 2.0 * np.pi, 33)
     circle = SIGMAS * scale * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     axes = vectors * np.sqrt(np.maximum(variances, 0.0))[:, None, :]

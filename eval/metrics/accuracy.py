@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 from typing import Final
 
 import numpy as np
@@ -16,7 +17,8 @@ from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.sim.curves import along_polyline, arc_lengths
-from pathspace_graph.spline.bspline import BSpline, segments_cross
+from pathspace_graph.spline.boundary import crossing_segments
+from pathspace_graph.spline.bspline import BSpline
 
 MISSED_DISTANCE: Final = 3.0  # distance from its boundary beyond which a cone is missed (m; Table 1)
 GHOST_DISTANCE: Final = 2.0  # distance from its boundary beyond which a mapped point is a ghost (m)
@@ -192,21 +194,13 @@ def curve_distance(track: Map, truth: Truth) -> dict[str, float]:
 
 def crossings(track: Map) -> tuple[int, int]:
     """Return how often the curves of a map cross each other, and how often they cross themselves."""
-    chords, owner = [np.zeros((0, 2, 2))], [np.zeros(0)]
-    for label, boundary in track.boundaries.items():
+    lines = []
+    for boundary in track.boundaries.values():
         if isinstance(boundary, SplineBoundary):
             points = mapped_points(boundary, 0.25)
-            ends = np.roll(points, -1, axis=0) if boundary.spline.periodic else points[1:]
-            chords.append(np.stack([points[: len(ends)], ends], axis=1))
-            owner.append(np.full(len(ends), label))
-    begin, end = np.concatenate(chords).transpose(1, 0, 2)
-    of = np.concatenate(owner)
-    other = own = 0
-    for k, (a, b) in enumerate(zip(begin, end, strict=True)):
-        crossed = segments_cross(a, b, begin[k:], end[k:])
-        other += int((crossed & (of[k:] != of[k])).sum())
-        own += int((crossed & (of[k:] == of[k])).sum())
-    return other, own
+            lines.append(np.concatenate([points, points[:1]]) if boundary.spline.periodic else points)
+    other = sum(len(crossing_segments(*pair)[0]) for pair in combinations(lines, 2))
+    return other, sum(len(crossing_segments(line, line)[0]) // 2 for line in lines)
 
 
 def centre_line_errors(track: Map, truth: Truth) -> dict[str, tuple[Array, Array]]:

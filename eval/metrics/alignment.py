@@ -1,8 +1,8 @@
-"""Two maps of the same track, laid on each other: how far apart they are, along both boundaries."""
+"""Two maps of one track: how far apart they are when laid on each other, and where they differ in place."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -17,6 +17,7 @@ from pathspace_graph.labels import BOUNDARIES, NAMES
 from .accuracy import boundary_distances, cones_of, mapped_points, mean_of, root_mean_square
 from .consistency import near_pairs
 
+DIFFERENT: Final = 0.5  # distance of both curves from which on they differ (m): more than a refinement
 STEP: Final = 0.5  # distance of the points of a curve that are compared (m)
 AHEAD: Final = (0.0, -4.0, -2.0, 2.0, 4.0)  # where the other drive may have started, if in the same place (m)
 TURN: Final = np.deg2rad(2.0)  # step of the headings that are tried where it may have started anywhere
@@ -39,29 +40,25 @@ class MapsApart:
     @property
     def mean(self) -> float:
         """Return the mean two-way distance (m); infinite where the maps share no boundary."""
-        return mean_of(self._all) if self.distances else np.inf
-
-    @property
-    def _all(self) -> Array:
-        return np.concatenate([np.zeros(0), *self.distances.values()])
+        return self.statistics()["both"]["mean"] if self.distances else np.inf
 
     def statistics(self) -> dict[str, dict[str, float]]:
         """Return mean, rms, 95th percentile and largest distance (m), of both boundaries and of each."""
         each = {NAMES[label]: own for label, own in sorted(self.distances.items())}
-        return {name: _statistics(own) for name, own in {"both": self._all, **each}.items()}
+        both = np.concatenate([np.zeros(0), *self.distances.values()])
+        return {
+            name: {
+                "mean": mean_of(own),
+                "rms": root_mean_square(own),
+                "p95": float(np.percentile(own, 95.0)),
+                "max": float(own.max()),
+            }
+            for name, own in {"both": both, **each}.items()
+        }
 
     def to_json(self) -> dict[str, Any]:
         """Return the motion and the statistics in plain types."""
         return {"motion": self.motion, "distances": self.statistics()}
-
-
-def _statistics(distances: Array) -> dict[str, float]:
-    return {
-        "mean": mean_of(distances),
-        "rms": root_mean_square(distances),
-        "p95": float(np.percentile(distances, 95.0)),
-        "max": float(distances.max()),
-    }
 
 
 def maps_apart(track: Map, reference: Map) -> MapsApart:
@@ -75,7 +72,17 @@ def maps_apart(track: Map, reference: Map) -> MapsApart:
         raise SettingsError("maps: expected a boundary that both have, found none")
     first, second = ([of.boundaries[label] for label in shared] for of in (track, reference))
     points, others = ([mapped_points(boundary, STEP) for boundary in of] for of in (first, second))
-    tries = [_apart(shared, points, others, first, second, start) for start in _starts(points, others)]
+    tries = []
+    for start in _starts(points, others):
+        motion = aligning(points, second, start)
+        back, both, distances = inverse(motion), dict[int, Array](), dict[int, Array]()
+        for k, label in enumerate(shared):
+            moved, returned = move_points(motion, points[k]), move_points(back, others[k])
+            both[label] = np.concatenate([moved, others[k]])
+            ways = boundary_distances(second[k], moved), boundary_distances(first[k], returned)
+            distances[label] = np.concatenate(ways)
+        motion = np.append(motion[:2], wrap_angle(motion[2:]))
+        tries.append(MapsApart(motion, both, distances))
     return min(tries, key=lambda one: one.mean)
 
 
@@ -96,25 +103,6 @@ def shape_rmse(track: Map, truth: Truth) -> float:
     pairs = zip(boundaries, cones, strict=True)
     distances = [boundary_distances(boundary, move_points(motion, own)) for boundary, own in pairs]
     return root_mean_square(np.concatenate([np.zeros(0), *distances]))
-
-
-def _apart(
-    labels: Sequence[int],
-    points: Sequence[Array],
-    others: Sequence[Array],
-    first: Sequence[MapBoundary],
-    second: Sequence[MapBoundary],
-    start: Array,
-) -> MapsApart:
-    motion = aligning(points, second, start)
-    back, both, distances = inverse(motion), dict[int, Array](), dict[int, Array]()
-    for k, label in enumerate(labels):
-        moved, returned = move_points(motion, points[k]), move_points(back, others[k])
-        both[label] = np.concatenate([moved, others[k]])
-        ways = boundary_distances(second[k], moved), boundary_distances(first[k], returned)
-        distances[label] = np.concatenate(ways)
-    motion = np.append(motion[:2], wrap_angle(motion[2:]))
-    return MapsApart(motion, both, distances)
 
 
 def _starts(points: Sequence[Array], others: Sequence[Array]) -> list[Array]:
@@ -147,3 +135,42 @@ def aligning(points: Sequence[Array], boundaries: Sequence[MapBoundary], start: 
         if np.abs(step).max() < STILL:
             break
     return motion
+
+
+@dataclass(frozen=True)
+class MapDifference:
+    """A stretch of a boundary that is not where the known map has it."""
+
+    LENGTHS: ClassVar = {"x": 1, "y": 1, "length": 1, "distance": 1}
+
+    boundary: str
+    x: float
+    """Place of the largest distance, m, map frame."""
+    y: float
+    length: float
+    """Length of the stretch, m."""
+    distance: float
+    """Largest distance of the curve from the known one, m."""
+
+    @property
+    def line(self) -> str:
+        place = f"at x = {self.x:.1f} m, y = {self.y:.1f} m"
+        off = f"up to {self.distance:.2f} m from the known map"
+        return f"the {self.boundary} boundary is {off} on {self.length:.0f} m, {place}"
+
+
+def differences(known: Map, found: Map) -> list[MapDifference]:
+    """Return the stretches of a found map that lie beside those of the known one, at scale 1."""
+    stretches = list[MapDifference]()
+    for label in sorted(set(found.splines) & set(known.splines)):
+        points = mapped_points(found.boundaries[label], STEP)
+        away = boundary_distances(known.boundaries[label], points)
+        differs = away > DIFFERENT
+        begins = np.flatnonzero(differs & ~np.append(False, differs[:-1]))
+        for begin in begins.tolist():
+            end = begin + int(np.append(differs[begin:], False).argmin())
+            worst = begin + int(away[begin:end].argmax())
+            x, y = points[worst].tolist()
+            length = STEP * (end - begin)
+            stretches.append(MapDifference(NAMES[label], x, y, length, float(away[worst])))
+    return stretches

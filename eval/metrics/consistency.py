@@ -58,7 +58,7 @@ def map_nees(track: Map, truth: Truth) -> NormalizedError:
     its turn, and that of a closed map by its size too; both then count to first order. An open map hardly
     shows its size.
     """
-    found = _fitted(track, truth, 2 if track.closed else 1)
+    found = similarity_from_truth(track, truth, 2 if track.closed else 1)
     laid = np.nan_to_num([*(one.value for one in found), 0.0][:2])
     truth_laid = aligned(truth, *laid)
     value, dof = 0.0, 0
@@ -163,33 +163,19 @@ class Deviation:
         return (self.value / self.sigma) ** 2 if self.sigma > 0.0 else float("nan")
 
 
-def turn_from_truth(track: Map, truth: Truth) -> Deviation:
-    """Return the angle a (rad) that minimizes `sum (n . (R(a) p - S))^2` over the true cones p.
-
-    S is the foot point of R(a) p on the map's own boundary, found anew in every round, and n is the normal
-    there; a landmark has both axes for normals. Cones farther than 3 m from the map, and those beyond the
-    ends of an open curve, don't count. The angle is linear in the map's points near the solution, so their
-    joint covariance gives its variance.
-    """
-    return _fitted(track, truth, 1)[0]
-
-
-def similarity_from_truth(track: Map, truth: Truth) -> tuple[Deviation, Deviation]:
-    """Return the turn a (rad) and the logarithm b of the map's scale by that of the truth.
-
-    They minimize `sum (n . (exp(b) R(a) p - S))^2` together, as `turn_from_truth` does.
-    """
-    turn, scale = _fitted(track, truth, 2)
-    return turn, scale
-
-
 def aligned(truth: Truth, turn: float, scale: float) -> Truth:
     """Return the truth with its cones turned about the start (rad), and `exp(scale)` times as far from it."""
     return replace(truth, cones=np.exp(scale) * truth.cones @ rotation(turn).T)
 
 
-def _fitted(track: Map, truth: Truth, count: int) -> list[Deviation]:
-    """Return the first `count` of turn and scale that lay the true cones on the map, by Gauss-Newton."""
+def similarity_from_truth(track: Map, truth: Truth, count: int = 2) -> list[Deviation]:
+    """Return the turn a (rad) and the logarithm b of the map's scale by that of the truth, or a alone.
+
+    They minimize `sum (n . (exp(b) R(a) p - S))^2` over the true cones p. S is the foot point of the moved
+    cone on the map's own boundary, found anew in every round, and n is the normal there; a landmark has both
+    axes for normals. Cones farther than 3 m from the map, and those beyond the ends of an open curve, don't
+    count. Near the solution both are linear in the map's points, whose joint covariance gives their variance.
+    """
     motion, (error, lever, gradient) = np.zeros(2), _rows(track, truth)
     for _ in range(50):
         if len(error) == 0 or np.linalg.matrix_rank(lever[:, :count]) < count:

@@ -1,10 +1,10 @@
 """What is measured of a run: one function measures all metrics, lap by lap and of the whole."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import seen_cycles
@@ -16,14 +16,7 @@ from pathspace_graph.plausibility.diagnosis import by_prior
 
 from . import accuracy, trajectory
 from .accuracy import true_lap_ends
-from .consistency import (
-    aligned,
-    consistency_at_cones,
-    map_nees,
-    similarity_from_truth,
-    turn_from_truth,
-    with_marginals,
-)
+from .consistency import aligned, consistency_at_cones, map_nees, similarity_from_truth, with_marginals
 from .registration import end_by_registration
 from .summary import has_cones, lap_times
 
@@ -38,16 +31,11 @@ def stage_times(cycles: Sequence[CycleRecord]) -> list[dict[str, Any]]:
     """
     if not cycles:
         return []
-    names = dict.fromkeys(name for record in cycles for name in record.stages)
-    columns = {WHOLE: [record.seconds for record in cycles]}
-    columns |= {name: [record.stages.get(name, 0.0) for record in cycles] for name in names}
-    total = float(np.mean(columns[WHOLE]))
-    times = []
-    for name, seconds in columns.items():
-        mean, (median, p99) = float(np.mean(seconds)), np.quantile(seconds, [0.5, 0.99]).tolist()
-        share = mean / total if total > 0.0 else float("nan")
-        times.append({"stage": name, "mean": mean, "median": median, "p99": p99, "share": share})
-    return times
+    seconds = pd.DataFrame([{WHOLE: record.seconds, **record.stages} for record in cycles]).fillna(0.0)
+    means, (medians, p99s) = seconds.mean(), seconds.quantile([0.5, 0.99]).to_numpy()
+    found = pd.DataFrame({"stage": seconds.columns, "mean": means, "median": medians, "p99": p99s})
+    total = means[WHOLE]
+    return [*found.assign(share=means / total if total > 0.0 else np.nan).to_dict("records")]
 
 
 def map_bytes(track: Map) -> int:
@@ -62,14 +50,11 @@ def covariance_bytes(track: Map) -> int:
     return 8 * sum(boundary.size * (2 * boundary.size + 1) for boundary in track.boundaries.values())
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """Metrics of one lap, or of a whole run."""
+Row = dict[str, Any]
+"""Metrics of a `lap`, or of a whole run, whose lap is None.
 
-    lap: int | None  # number of the lap, from 1; None for the whole run
-    values: dict[str, float]
-    """Values by the metric's key, counts as whole numbers and `closed` as a truth value. Unknown ones, for
-    example without truth, are absent."""
+Counts are whole numbers and `closed` a truth value. Unknown ones, for example without truth, are absent.
+"""
 
 
 def measure(
@@ -84,15 +69,13 @@ def measure(
     row, that of the last lap. `took` is the wall time and the processor time of the whole run (s).
     """
     run, log = run.at_scale_one(), log.at_scale_one()
-    rows = []
+    rows = list[Row]()
     for lap, track, begin, end in _laps(run, log):
-        of_map = _map_values(track, log.truth)
-        rows.append(Row(lap, of_map | _drive_values(run, log.truth, begin, end)))
-    values = _map_values(run.map, log.truth)
+        of_lap = _map_values(track, log.truth) | _drive_values(run, log.truth, begin, end)
+        rows.append({"lap": lap, **of_lap})
+    values: Row = {"lap": None} | _map_values(run.map, log.truth)
     values |= _drive_values(run, log.truth, -np.inf, np.inf)
-    values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log.truth)
-    if not has_cones(log.truth):
-        values |= _values_without_truth(run, log)
+    values |= {"closed_at_end": bool(run.map.closed)} | _end_values(run, log)
     health = [record.health for record in run.cycles]
     if any(health):
         values |= {f"reported_{level}": health.count(level) / len(health) for level in (DEGRADED, LOST)}
@@ -102,7 +85,7 @@ def measure(
         values |= {"converged": run.converged, "cost": run.cost}
     if took is not None:
         values["seconds"], values["seconds_processor"] = took
-    return [*rows, Row(None, values)]
+    return [*rows, values]
 
 
 def _laps(run: RunResult, log: Log) -> Iterator[tuple[int, Map, float, float]]:
@@ -131,62 +114,47 @@ def _map_values(track: Map, truth: Truth | None) -> dict[str, float]:
         return values
     values |= accuracy.cone_errors(track, truth) | accuracy.curve_distance(track, truth)
     values |= accuracy.ghosts(track, truth)
-    values |= _consistency_values(track, truth) | _centre_values(track, truth)
-    values |= _whole_map_values(track, truth)
-    found = consistency_at_cones(with_marginals(track), truth)
-    return values | {f"{key}_marginals": value for key, value in found.items()}
-
-
-def _whole_map_values(track: Map, truth: Truth) -> dict[str, float]:
-    """Return turn and scale of the map with their claims, and its rmse (m) without both."""
-    turn, (turned, scale) = turn_from_truth(track, truth), similarity_from_truth(track, truth)
-    values = {"turn": turn.value, "turn_nees": turn.nees}
-    values |= {"map_scale": scale.value, "map_scale_nees": scale.nees}
-    if not np.isnan(scale.value):
-        found = accuracy.cone_errors(track, aligned(truth, turned.value, scale.value))
-        values["rmse_aligned"] = found["rmse"] / np.exp(scale.value)
-    return {key: value for key, value in values.items() if not np.isnan(value)}
-
-
-def _consistency_values(track: Map, truth: Truth) -> dict[str, float]:
-    return {"nees": map_nees(track, truth).ratio} | consistency_at_cones(track, truth)
-
-
-def _centre_values(track: Map, truth: Truth) -> dict[str, float]:
-    """Return the rms errors (m) of the centre line and of its widths, and mean e^2 / sigma^2 of each."""
-    values = {}
+    values |= {"nees": map_nees(track, truth).ratio} | consistency_at_cones(track, truth)
     for name, (error, sigma) in accuracy.centre_line_errors(track, truth).items():
         known = ~np.isnan(error)
         if known.any():
             values[name] = accuracy.root_mean_square(error[known])
             if (sigma[known] > 0.0).all():
                 values[f"{name}_nees"] = float(np.mean((error[known] / sigma[known]) ** 2))
-    return values
+    (turn,), (turned, scale) = similarity_from_truth(track, truth, 1), similarity_from_truth(track, truth)
+    whole = {"turn": turn.value, "turn_nees": turn.nees}
+    whole |= {"map_scale": scale.value, "map_scale_nees": scale.nees}
+    if not np.isnan(scale.value):
+        found = accuracy.cone_errors(track, aligned(truth, turned.value, scale.value))
+        whole["rmse_aligned"] = found["rmse"] / np.exp(scale.value)
+    values |= {key: value for key, value in whole.items() if not np.isnan(value)}
+    found = consistency_at_cones(with_marginals(track), truth)
+    return values | {f"{key}_marginals": value for key, value in found.items()}
 
 
-def _end_values(run: RunResult, truth: Truth | None) -> dict[str, float]:
-    """Return errors of the vehicle at the log's end, its largest jump (m), and whether it closed falsely."""
+def _end_values(run: RunResult, log: Log) -> dict[str, float]:
+    """Return errors of the vehicle at the log's end, its largest jump (m), and whether it closed falsely.
+
+    Without true cones there are crossings of the map, and how far (m) the last pose is from its registration.
+    """
     values: dict[str, float] = {}
-    if truth is None or len(run.trajectory) == 0:
+    truth, t, poses = log.truth, run.trajectory_t, run.trajectory
+    if not has_cones(truth):
+        values["crossings"] = sum(accuracy.crossings(run.map))
+        if log.measured is not None and len(poses):
+            end = end_by_registration(seen_cycles(log)[0], log.measured)
+            if not isinstance(end, str):
+                values["end_off"] = float(np.hypot(*(poses[-1, :2] - end[:2])))
+    if truth is None or len(poses) == 0:
         return values
     if run.vehicle is not None:
-        values |= trajectory.vehicle_errors(run.vehicle, float(run.trajectory_t[-1]), truth)
+        values |= trajectory.vehicle_errors(run.vehicle, float(t[-1]), truth)
     if len(truth.poses):
         values["false_closing"] = closes_falsely(run, truth)
-        values |= trajectory.end_of_trajectory(run.trajectory_t, run.trajectory, truth)
-        values |= trajectory.longest_divergence(run.trajectory_t, run.trajectory, truth, closing_stamp(run))
+        values |= trajectory.end_of_trajectory(t, poses, truth)
+        values |= trajectory.longest_divergence(t, poses, truth, closing_stamp(run))
     jumps = [np.hypot(*record.jump[:2]) for record in run.cycles if record.jump is not None]
     return values | ({"jump": float(max(jumps))} if jumps else {})
-
-
-def _values_without_truth(run: RunResult, log: Log) -> dict[str, float]:
-    """Return crossings of the map, and how far (m) the last pose is from its registration."""
-    values: dict[str, float] = {"crossings": sum(accuracy.crossings(run.map))}
-    if log.measured is not None and len(run.trajectory):
-        end = end_by_registration(seen_cycles(log)[0], log.measured)
-        if not isinstance(end, str):
-            values["end_off"] = float(np.hypot(*(run.trajectory[-1, :2] - end[:2])))
-    return values
 
 
 def closes_falsely(run: RunResult, truth: Truth) -> bool:

@@ -1,7 +1,6 @@
-"""What a run is compared with: the landmark batch that is told all about its log, and another run."""
+"""What a run is compared with: the landmark batch that is told all about its log."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -13,16 +12,8 @@ from pathspace_graph.io.log import Detections, Log, Truth
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import CalibrationSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track import Track
 
 from .accuracy import root_mean_square
-
-
-def landmark_limit(track: Track, settings: SimulationSettings, seed: int) -> list[dict[str, Any]]:
-    """Return the row of a simulated drive: the rmse (m) of the landmark batch that is told all."""
-    log = simulate(track, settings, seed)
-    return [{"track": track.name, "rmse": landmark_rmse(solve_oracle_landmarks(log)[1], truth_of(log))}]
 
 
 def solve_oracle_landmarks(log: Log) -> tuple[LandmarkSystem, LandmarkState]:

@@ -14,12 +14,11 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import Health, HealthStretch, counts, stretches
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
 from pathspace_graph.plausibility.hint import Hint
-from pathspace_graph.spline.crossing import Crossing
 
 from .accuracy import LapMetrics, lap_metrics, root_mean_square, true_lap_ends
 from .consistency import consistency_at_cones
@@ -30,6 +29,7 @@ GATE: Final = ("dropped", "refused")  # counts of the gate in each cycle
 
 def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
     """Return the estimator, settings, versions, laps, timing, hints, and with truth the paper's metrics."""
+    factor = 1.0 / result.scale
     summary: dict[str, Any] = {
         "estimator": result.estimator,
         "settings": result.settings,
@@ -45,17 +45,23 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         **_cycles(result),
     }
     if crossed := crossings_of(result):
-        summary["crossings"] = [_crossing(one) for one in crossed]
+        places = [(NAMES[one.label], *one.place.tolist(), one.driven) for one in crossed]
+        keys = ("boundary", "x", "y", "driven")
+        summary["crossings"] = [dict(zip(keys, place, strict=True)) for place in places]
     if hints:
         summary["hints"] = [vars(hint) for hint in hints]
     if result.noise is not None:
         summary["noise"] = _noise(result.noise, log)
-        notes = noise_lines(scaled(result.noise, 1.0 / result.scale))
+        notes = noise_lines(scaled(result.noise, factor))
         summary |= {"notes": notes} if notes else {}
     if result.vehicle is not None:
-        summary |= _calibration(result.vehicle, result)
+        named, found = result.vehicle.by_name, diagnose(scaled(result.vehicle, factor), result.settings)
+        values = {name: value for name, (value, _) in named.items()}
+        values |= {f"{name}_sigma": sigma for name, (_, sigma) in named.items()}
+        summary |= {"calibration": values, "heading_sigma": float(result.vehicle.sigmas[2])}
+        summary |= {"diagnosis": found} if found else {}
     if log.truth is not None:
-        summary |= _map_errors(result, log, log.truth) | _trajectory_errors(result, log.truth)
+        summary |= _errors(result, log, log.truth)
     return summary
 
 
@@ -78,18 +84,21 @@ def _cycles(result: RunResult) -> dict[str, Any]:
     return found
 
 
-def _calibration(state: VehicleState, result: RunResult) -> dict[str, Any]:
-    """Calibrations with their sigmas, and a diagnosis where one is far from its prior."""
-    values = {name: value for name, (value, _) in state.by_name.items()}
-    values |= {f"{name}_sigma": sigma for name, (_, sigma) in state.by_name.items()}
-    found = diagnose(scaled(state, 1.0 / result.scale), result.settings)
-    calibration = {"calibration": values, "heading_sigma": float(state.sigmas[2])}
-    return calibration | ({"diagnosis": found} if found else {})
-
-
-def _crossing(crossing: Crossing) -> dict[str, Any]:
-    x, y = crossing.place.tolist()
-    return {"boundary": NAMES[crossing.label], "x": x, "y": y, "driven": crossing.driven}
+def _errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
+    """Errors of the map, and of the trajectory: `ate`, rms along (m), across (m) and in heading (rad)."""
+    found: dict[str, Any] = {}
+    if has_cones(truth):
+        found["laps"] = [asdict(row) for row in laps_of(result, log)]
+        found["final"] = asdict(_metrics(result.map, truth, result.laps, result.scale))
+        del found["final"]["lap"]
+        at_cones = consistency_at_cones(result.at_scale_one().map, scaled(truth, 1.0 / result.scale))
+        found["inside_two_sigma"] = at_cones["inside"]
+    if len(truth.poses) and len(result.trajectory):
+        errors = trajectory_errors(result.trajectory_t, result.trajectory, truth)
+        names = ("rmse_along", "rmse_across", "rmse_heading")
+        found["ate"] = position_rms(errors)
+        found |= dict(zip(names, map(root_mean_square, errors.T), strict=True))
+    return found
 
 
 def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
@@ -176,23 +185,3 @@ def not_mapped(track: Map, log: Log) -> list[str]:
 def has_cones(truth: Truth | None) -> TypeGuard[Truth]:
     """Return whether there is a truth that holds cones of a boundary."""
     return truth is not None and bool(np.isin(truth.cone_labels, BOUNDARIES).any())
-
-
-def _map_errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
-    if not has_cones(truth):
-        return {}
-    final = asdict(_metrics(result.map, truth, result.laps, result.scale))
-    del final["lap"]
-    at_cones = consistency_at_cones(result.at_scale_one().map, scaled(truth, 1.0 / result.scale))
-    laps = [asdict(row) for row in laps_of(result, log)]
-    return {"laps": laps, "final": final, "inside_two_sigma": at_cones["inside"]}
-
-
-def _trajectory_errors(result: RunResult, truth: Truth) -> dict[str, float]:
-    """Return `ate`, and the root mean square error along (m), across (m) and in heading (rad)."""
-    if len(truth.poses) == 0 or len(result.trajectory) == 0:
-        return {}
-    errors = trajectory_errors(result.trajectory_t, result.trajectory, truth)
-    along, across, heading = (root_mean_square(column) for column in errors.T)
-    by_axis = {"rmse_along": along, "rmse_across": across, "rmse_heading": heading}
-    return {"ate": position_rms(errors), **by_axis}

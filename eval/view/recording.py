@@ -21,7 +21,7 @@ from pathspace_graph.health import CONDITIONS, LOST, Health
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
-from pathspace_graph.labels import BIG_ORANGE, BOUNDARIES, NAMES
+from pathspace_graph.labels import BIG_ORANGE, NAMES
 from pathspace_graph.labels import ORANGE as ORANGE_CONE
 from pathspace_graph.run import ObservedCycle
 from pathspace_graph.settings.output import RecordingSettings
@@ -97,11 +97,10 @@ def _open_window(rerun: Any, stream: Any) -> None:
     viewer = {"executable_path": str(beside) if beside.exists() else None, "hide_welcome_screen": True}
     try:
         rerun.spawn(port=PORT, connect=False, recording=stream, **viewer)
+        socket.create_connection(("127.0.0.1", PORT), 2.0).close()
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
         raise SettingsError(f"--view: the viewer could not be started: {reason}") from error
-    try:
-        socket.create_connection(("127.0.0.1", PORT), 2.0).close()
     except OSError as error:
         raise SettingsError(f"--view: expected the viewer on port {PORT}, found none: {error}") from error
 
@@ -172,6 +171,7 @@ class Recorder:
             self._log_static(TRUE_CONES, rerun.Points2D(truth.cones))
 
     def __call__(self, cycle: ObservedCycle) -> None:
+        rerun, log, pose = self._rerun, self._stream.log, np.asarray(cycle.result.pose, float)
         self._stream.set_time(TIMELINE, sequence=cycle.number)
         self._stream.set_time(TIME, duration=cycle.detections.t)
         self._show_map(cycle.outline)
@@ -179,40 +179,54 @@ class Recorder:
         if cycle.number % self._settings.band_every == 0 or replaced:
             for label, boundary in cycle.map.boundaries.items():
                 self._lines(_path(label, "band"), self._band(boundary))
-        self._show_vehicle(cycle)
-        self._show_readings(cycle)
-        self._show_figures(cycle)
+        self._lines(VEHICLE, [to_map(OUTLINE, np.tile(pose, (len(OUTLINE), 1)))])
+        before = pose if self._last_pose is None else self._last_pose
+        self._lines(TRAJECTORY, [np.array([before[:2], pose[:2]])])
+        self._last_pose = pose
+        if len(cycle.window):
+            self._lines(WINDOW, [cycle.window[:, :2]])
+        readings, seen = cycle.readings, cycle.detections.points_vehicle
+        if readings is None:
+            self._points(f"{READINGS}/detected", to_map(seen, np.tile(pose, (len(seen), 1))))
+        else:
+            self._points(f"{READINGS}/used", readings.points[readings.used])
+            self._points(f"{READINGS}/gated", readings.points[~readings.used])
+            self._lines(FEET, list(np.stack([readings.points, readings.feet], axis=1)[readings.used]))
+        values = (1e3 * cycle.seconds, *cycle.result.sizes, len(seen), cycle.result.readings)
+        for path, value in zip(_SERIES, values, strict=True):
+            if np.isfinite(value):
+                log(path, rerun.Scalars(value))
         self._show_messages(cycle)
 
     def _set_styles(self) -> None:
         rerun = self._rerun
+        lines, points = rerun.LineStrips2D, rerun.Points2D
+        styles = [  # kind, entity, colour, radius and order of drawing
+            *((lines, _path(k, "curve"), color, 1.5, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
+            *((lines, _path(k, "tentative"), color, 1.0, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
+            *((lines, _path(k, "band"), pale(color), 0.7, LOW) for k, color in BOUNDARY_COLORS.items()),
+            *((points, _path(k, "points"), color, 2.0, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
+            (points, _path(ORANGE_CONE, "points"), RED, 2.0, MIDDLE),
+            (points, _path(BIG_ORANGE, "points"), RED, 3.0, MIDDLE),
+            (lines, TRAJECTORY, TRAJECTORY_COLOR, 0.7, MIDDLE),
+            (lines, WINDOW, TRAJECTORY_COLOR, 2.0, HIGH),
+            (lines, VEHICLE, "#000000", 1.5, TOP),
+            (lines, FEET, DARK, 0.7, HIGH),
+            (points, f"{READINGS}/used", DARK, 3.0, TOP),
+            (points, f"{READINGS}/gated", RED, 3.0, TOP),
+            (points, f"{READINGS}/detected", GREY, 3.0, TOP),
+            (points, TRUE_CONES, LIGHT, 2.0, LOW),
+        ]
         # the y axis of a two-dimensional view points down, as that of a picture does
         self._log_static(MAP, rerun.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
-        lines, points = rerun.LineStrips2D, rerun.Points2D
-        for label in BOUNDARIES:
-            color = BOUNDARY_COLORS[label]
-            self._style(lines, _path(label, "curve"), color, 1.5, MIDDLE)
-            self._style(lines, _path(label, "tentative"), color, 1.0, MIDDLE)
-            self._style(lines, _path(label, "band"), pale(color), 0.7, LOW)
-            self._style(points, _path(label, "points"), color, 2.0, MIDDLE)
-        for label, size in ((ORANGE_CONE, 2.0), (BIG_ORANGE, 3.0)):
-            self._style(points, _path(label, "points"), RED, size, MIDDLE)
-        self._style(lines, TRAJECTORY, TRAJECTORY_COLOR, 0.7, MIDDLE)
-        self._style(lines, WINDOW, TRAJECTORY_COLOR, 2.0, HIGH)
-        self._style(lines, VEHICLE, "#000000", 1.5, TOP)
-        self._style(lines, FEET, DARK, 0.7, HIGH)
-        for name, color in (("used", DARK), ("gated", RED), ("detected", GREY)):
-            self._style(points, f"{READINGS}/{name}", color, 3.0, TOP)
-        self._style(points, TRUE_CONES, LIGHT, 2.0, LOW)
+        for kind, path, color, radius, order in styles:
+            radii = [rerun.Radius.ui_points(radius)]
+            self._log_static(path, kind.from_fields(colors=[_rgb(color)], radii=radii, draw_order=order))
         for path, color in _SERIES.items():
             name = path.rpartition("/")[2]
             self._log_static(path, rerun.SeriesLines(colors=[_rgb(color)], names=[name], widths=[1.0]))
         colors = [_rgb(HEALTH_COLORS.get(condition, GREEN)) for condition in CONDITIONS]
         self._log_static(HEALTH, rerun.StateConfiguration(values=list(CONDITIONS), colors=colors))
-
-    def _style(self, kind: Any, path: str, color: str, radius: float, order: float) -> None:
-        radii = [self._rerun.Radius.ui_points(radius)]
-        self._log_static(path, kind.from_fields(colors=[_rgb(color)], radii=radii, draw_order=order))
 
     def _log_static(self, path: str, what: Any) -> None:
         self._stream.log(path, what, static=True)
@@ -244,52 +258,24 @@ class Recorder:
             return list(style.uncertainty_band(boundary, u))
         return list(style.ellipse_outlines(boundary.points, boundary.covariance))
 
-    def _show_vehicle(self, cycle: ObservedCycle) -> None:
-        """Show the vehicle, the way that it has come since the cycle before, and the window."""
-        pose = np.array(cycle.result.pose, float)
-        self._lines(VEHICLE, [to_map(OUTLINE, np.tile(pose, (len(OUTLINE), 1)))])
-        before = pose if self._last_pose is None else self._last_pose
-        self._lines(TRAJECTORY, [np.array([before[:2], pose[:2]])])
-        self._last_pose = pose
-        if len(cycle.window):
-            self._lines(WINDOW, [cycle.window[:, :2]])
-
-    def _show_readings(self, cycle: ObservedCycle) -> None:
-        readings = cycle.readings
-        if readings is None:
-            points = cycle.detections.points_vehicle
-            pose = np.asarray(cycle.result.pose, float)
-            self._points(f"{READINGS}/detected", to_map(points, np.tile(pose, (len(points), 1))))
-            return
-        self._points(f"{READINGS}/used", readings.points[readings.used])
-        self._points(f"{READINGS}/gated", readings.points[~readings.used])
-        self._lines(FEET, list(np.stack([readings.points, readings.feet], axis=1)[readings.used]))
-
-    def _show_figures(self, cycle: ObservedCycle) -> None:
-        offered, used = len(cycle.detections.labels), cycle.result.readings
-        values = (1e3 * cycle.seconds, *cycle.result.sizes, offered, used)
-        for path, value in zip(_SERIES, values, strict=True):
-            if np.isfinite(value):
-                self._stream.log(path, self._rerun.Scalars(value))
-
     def _show_messages(self, cycle: ObservedCycle) -> None:
         result, health, levels = cycle.result, cycle.result.health, self._rerun.TextLogLevel
         if health.condition and health.condition != self._last_health.condition:
             self._stream.log(HEALTH, self._rerun.StateChange(state=[health.condition]))
+        said = list[tuple[str, str]]()
         if health.condition and health != self._last_health:
-            level = levels.WARN if health.reason else levels.INFO
-            text = f"{health.condition}: {health.reason}" if health.reason else health.condition
-            self._say(text, levels.ERROR if health.condition == LOST else level)
-        closes = result.closed and not self._closed
-        said = [f"the loop is closed, on {sum(result.sizes)} points"] if closes else []
+            level = (
+                levels.ERROR if health.condition == LOST else levels.WARN if health.reason else levels.INFO
+            )
+            said.append((": ".join(filter(None, (health.condition, health.reason))), level))
+        told = [f"the loop is closed, on {sum(result.sizes)} points"] * (result.closed and not self._closed)
         if result.jump is not None:
-            said.append(f"the pose has jumped by {np.hypot(*result.jump[:2]):.2f} m")
-        if said or result.notice:
-            self._say("; ".join(filter(None, (*said, result.notice))), levels.INFO)
+            told.append(f"the pose has jumped by {np.hypot(*result.jump[:2]):.2f} m")
+        if told or result.notice:
+            said.append(("; ".join(filter(None, (*told, result.notice))), levels.INFO))
+        for text, level in said:
+            self._stream.log(MESSAGES, self._rerun.TextLog(text, level=level))
         self._last_health, self._closed = health, result.closed
-
-    def _say(self, text: str, level: str) -> None:
-        self._stream.log(MESSAGES, self._rerun.TextLog(text, level=level))
 
 
 def dashes(points: Array) -> list[Array]:

@@ -14,8 +14,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
 from pathspace_graph.eval.experiment import compare as experiment
 from pathspace_graph.eval.experiment.compare import Comparison, compare, side_by_side
-from pathspace_graph.eval.experiment.run import run_estimator
-from pathspace_graph.eval.experiment.runner import check_jobs, unfinished, workers
+from pathspace_graph.eval.experiment.run import check_jobs, run_estimator, unfinished, workers
 from pathspace_graph.eval.figures.map_plot import plot_apart, plot_map
 from pathspace_graph.eval.figures.style import save_plot
 from pathspace_graph.eval.metrics.alignment import maps_apart

@@ -22,7 +22,7 @@ from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
-from pathspace_graph.eval.metrics.differences import MapDifference, differences
+from pathspace_graph.eval.metrics.alignment import MapDifference, differences
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import inverse

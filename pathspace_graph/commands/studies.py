@@ -11,13 +11,11 @@ from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import ONLINE, check_online
 from pathspace_graph.eval import benchmark
-from pathspace_graph.eval.experiment.drives import log_folders
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
-from pathspace_graph.eval.experiment.run import make_plan, run_plan
-from pathspace_graph.eval.experiment.runner import check_jobs, of_other_code, unfinished
-from pathspace_graph.eval.experiment.study import Study, find_study, read_study_file
+from pathspace_graph.eval.experiment.run import check_jobs, make_plan, of_other_code, run_plan, unfinished
+from pathspace_graph.eval.experiment.study import Study, find_study, log_folders, read_study_file
 from pathspace_graph.eval.experiment.tables import write_study
-from pathspace_graph.eval.report import Plan, write_report
+from pathspace_graph.eval.report import ReportPlan, write_report
 from pathspace_graph.io.files import check_target
 from pathspace_graph.options.study import Ablate, FaultSuite, Report, Scale, StudyCommand
 from pathspace_graph.settings.evaluation import ScalingSettings
@@ -93,7 +91,7 @@ def report_command(options: Report) -> Outcome:
     check_jobs(options.jobs)
     drives: dict[str, Any] = {"tracks": options.tracks, "real": options.real, "quick": options.quick}
     with progress("runs", lines=LINES) as advance:
-        plan = Plan(jobs=options.jobs, on_cell=advance, **drives)
+        plan = ReportPlan(jobs=options.jobs, on_cell=advance, **drives)
         written = [*write_report(plan, options.out, options.only)]
     say(*(f"{file}\n{table.text()}\n" for file, table in written))
     return Outcome([file for file, _ in written], {file.stem: table.records() for file, table in written})

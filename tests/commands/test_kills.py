@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from pathspace_graph import estimators as registry
 from pathspace_graph.cli import parse, run_command
 from pathspace_graph.eval.experiment.run import run_estimator
-from pathspace_graph.eval.metrics.measures import Row
 from pathspace_graph.eval.metrics.summary import versions
 from pathspace_graph.io.files import atomic_file, atomic_folder
 from pathspace_graph.io.log import Log
@@ -126,12 +125,12 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     monkeypatch.setitem(registry.ONLINE, "fixed-lag", rings.Rings)  # the shipped study names it
     monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: Path(file).write_bytes(b"picture"))
     monkeypatch.setattr("pathspace_graph.eval.figures.style.SUFFIXES", (".png",))
-    study, rows = "pathspace_graph.eval.experiment", [Row(1, {"rmse": 0.5}), Row(None, {})]
-    monkeypatch.setattr(f"{study}.drives.Drive.load", lambda _: (recorded.log, ()))
+    study, rows = "pathspace_graph.eval.experiment", [{"lap": 1, "rmse": 0.5}, {"lap": None}]
+    monkeypatch.setattr(f"{study}.study.Drive.load", lambda _: (recorded.log, ()))
     monkeypatch.setattr(f"{study}.run.measure", lambda *_, **__: rows)
     monkeypatch.setattr(f"{study}.run.stage_times", lambda _: [])
     monkeypatch.setattr(f"{study}.run.summarize", lambda *_, **__: {})
-    monkeypatch.setattr(f"{study}.runner.made", lambda _: versions() | {"date": "then"})
+    monkeypatch.setattr(f"{study}.run.made", lambda _: versions() | {"date": "then"})
     monkeypatch.setattr(f"{study}.tables.plot_differences", lambda *_: Figure())
     track = write_round_track(tmp_path)
     (tmp_path / "small.toml").write_text(STUDY.format(track=track))

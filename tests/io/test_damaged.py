@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.experiment.run import make_plan
-from pathspace_graph.eval.experiment.runner import read_record, write_record
+from pathspace_graph.eval.experiment.run import make_plan, read_record, write_record
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.io.log import COLUMNS
 from pathspace_graph.io.log_files import read_log, write_log

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from pathspace_graph.errors import InputError, SettingsError
@@ -18,6 +19,7 @@ from pathspace_graph.eval.experiment.compare import (
     plan_of,
     side_by_side,
     tables,
+    write_comparison,
 )
 from pathspace_graph.eval.experiment.plots import Drawn, plot_maps
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
@@ -90,13 +92,15 @@ def test_rows_are_of_each_lap_and_of_the_log(folder: Path, tmp_path: Path) -> No
 def test_a_failure_is_told_and_the_rest_goes_on(folder: Path, tmp_path: Path) -> None:
     told: list[int] = []
     plan = plan_of(folder, ("broken", "rings"))
-    found = compare(plan, tmp_path, on_cell=lambda done, _: told.append(done))
+    found = compare(plan, tmp_path / "cells", on_cell=lambda done, _: told.append(done))
     assert [tuple(of.values()) for of in found.failures] == [
         ("a", "broken", "ValueError: lost the way"),
         ("b", "broken", "ValueError: lost the way"),
     ]
     assert told == [0, 1, 2, 3, 4] and len(found.frame) == 6
-    assert set(found.times["stage"]) == {"whole", "guess"}
+    write_comparison(tmp_path / "out", found, 1)
+    times = pd.read_csv(tmp_path / "out" / "times.csv")
+    assert set(times["stage"]) == {"whole", "guess"}
     table = paper_table(found)
     assert [*table.frame.iloc[0, :2]] == ["broken", "failed"]
 

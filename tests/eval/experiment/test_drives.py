@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.experiment.drives import Drive, load_tracks, track_digest
+from pathspace_graph.eval.experiment.study import load_tracks, simulated_drive, track_digest
 from pathspace_graph.sim.simulate import SimulationSettings
 
 from ...scenes.pretenders import write_round_track
@@ -50,11 +50,11 @@ def test_a_folder_without_tracks_and_a_missing_file_are_refused(tmp_path: Path) 
 
 def test_a_drive_is_the_same_by_geometry_seed_and_simulation_whatever_its_names() -> None:
     (track,) = load_tracks([0])
-    drive = Drive(track, 0, "nominal", SimulationSettings(laps=2))
-    renamed = replace(track, name="another name")
-    assert replace(drive, track=renamed, noise="quiet").id == drive.id
-    assert replace(drive, seed=1).id != drive.id
-    assert replace(drive, simulation=SimulationSettings(laps=3)).id != drive.id
+    two, three = (SimulationSettings(laps=laps) for laps in (2, 3))
+    drive, renamed = simulated_drive(track, 0, "nominal", two), replace(track, name="another name")
+    assert simulated_drive(renamed, 0, "quiet", two).id == drive.id
+    assert simulated_drive(track, 1, "nominal", two).id != drive.id
+    assert simulated_drive(track, 0, "nominal", three).id != drive.id
 
 
 def test_the_last_digits_of_a_track_do_not_matter_to_its_drives_and_a_centimetre_does() -> None:
@@ -73,4 +73,4 @@ def test_the_last_digits_of_a_track_do_not_matter_to_its_drives_and_a_centimetre
 
 def test_the_drives_of_a_generated_track_are_those_of_every_machine() -> None:
     """Another number makes other drives on all generated tracks, and all figures of the pages old."""
-    assert Drive(load_tracks([0])[0], 0, "nominal", SimulationSettings()).own_seed == 3921578876
+    assert simulated_drive(load_tracks([0])[0], 0, "nominal", SimulationSettings()).source == "3921578876"

@@ -9,8 +9,7 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.errors import InputError, OutputError, SettingsError
-from pathspace_graph.eval.experiment.run import make_plan, run_study
-from pathspace_graph.eval.experiment.runner import locked
+from pathspace_graph.eval.experiment.run import locked, make_plan, run_study
 from pathspace_graph.eval.experiment.study import Study, read_study_file, study_from
 from pathspace_graph.eval.experiment.tables import results_table, write_study
 from pathspace_graph.io.log_files import read_log, write_log
@@ -135,18 +134,6 @@ def test_the_page_goes_from_a_study_to_its_table_and_figures(
     assert (tmp_path / "differences.pdf").stat().st_size > 1000
     assert (tmp_path / "worst.pdf").stat().st_size > 1000
     assert "lag=1" in capsys.readouterr().out
-
-
-def test_the_page_s_script_works_for_a_study_without_a_comparison(
-    logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = tmp_path / "study.toml"
-    file.write_text(f'tracks = ["{write_round_track(tmp_path)}"]\nlaps = 1\nestimators = ["pretender"]')
-    study = read_study_file(file)
-    write_study(study, run_study(study, tmp_path / "out", keep=True), tmp_path / "out")
-    monkeypatch.chdir(tmp_path)
-    exec(compile(file_blocks(ROOT / "docs" / "ablate.md")["paper.py"], "paper.py", "exec"), {})
-    assert (tmp_path / "differences.pdf").stat().st_size > 1000
 
 
 def test_a_folder_in_which_a_study_runs_is_refused(logs: Path, tmp_path: Path) -> None:

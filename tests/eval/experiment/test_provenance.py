@@ -161,7 +161,7 @@ def test_a_worker_of_other_code_stops_the_study(
             forget()
         real(*arguments)
 
-    monkeypatch.setattr("pathspace_graph.eval.experiment.runner.check_code", changed)
+    monkeypatch.setattr("pathspace_graph.eval.experiment.run.check_code", changed)
     says = r"plugin_main: expected the code of \S+ .*plugin_lib.far \w{12}, found plugin_lib.far \w{12} on"
     with pytest.raises(SettingsError, match=says):
         run_study(of, tmp_path / "out")

@@ -14,13 +14,11 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.errors import OutputError, SettingsError
-from pathspace_graph.eval.experiment import drives
 from pathspace_graph.eval.experiment import run as study_run
-from pathspace_graph.eval.experiment import runner as store
-from pathspace_graph.eval.experiment.drives import Drive
+from pathspace_graph.eval.experiment import study as study_module
 from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.statistics import TIMES
-from pathspace_graph.eval.experiment.study import Study
+from pathspace_graph.eval.experiment.study import Drive, Study
 from pathspace_graph.eval.experiment.tables import without_times, write_study
 from pathspace_graph.io.log import Log
 from pathspace_graph.plausibility.hint import Hint
@@ -108,9 +106,9 @@ def test_results_load_into_pandas(study: Study, ran: tuple[Path, pd.DataFrame], 
 
 def test_a_log_is_simulated_once(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
     simulated = []
-    real = drives.simulate
-    monkeypatch.setattr(drives, "simulate", lambda *args: simulated.append(args) or real(*args))
-    monkeypatch.setattr(drives, "_latest", {})
+    real = study_module.simulate
+    monkeypatch.setattr(study_module, "simulate", lambda *args: simulated.append(args) or real(*args))
+    monkeypatch.setattr(study_module, "_latest", {})
     run_study(study)
     assert len(simulated) == len({seed for *_, seed in simulated}) == 2
 
@@ -165,11 +163,11 @@ def test_cells_of_other_code_are_run_again_and_counted(
     study: Study, ran: tuple[Path, pd.DataFrame], finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, first = ran
-    assert store.of_other_code(finished, study_run.make_plan(study).cells) == 0
+    assert study_run.of_other_code(finished, study_run.make_plan(study).cells) == 0
     code = study_run.code_of("pretender")
     monkeypatch.setattr(study_run, "code_of", lambda name: code | {"tests": "other"})
-    monkeypatch.setattr(store, "check_code", lambda *_: None)
-    assert store.of_other_code(finished, study_run.make_plan(study).cells) == len(first)
+    monkeypatch.setattr(study_run, "check_code", lambda *_: None)
+    assert study_run.of_other_code(finished, study_run.make_plan(study).cells) == len(first)
     again = run_study(study, finished)
     assert not set(again["cell"]) & set(first["cell"])
     pd.testing.assert_frame_equal(*(without_times(of).drop(columns="cell") for of in (again, first)))

@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.experiment.run import run_study
-from pathspace_graph.eval.experiment.runner import WorkerDiedError, outcomes, workers
+from pathspace_graph.eval.experiment.run import WorkerDiedError, outcomes, run_study, workers
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.eval.experiment.tables import without_times
 
@@ -55,7 +54,7 @@ def test_a_cluster_that_is_not_there_is_refused(
     real: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed", reason="dask isn't installed")
-    monkeypatch.setattr("pathspace_graph.eval.experiment.runner.CONNECT_SECONDS", 0.3)
+    monkeypatch.setattr("pathspace_graph.eval.experiment.run.CONNECT_SECONDS", 0.3)
     with pytest.raises(SettingsError, match=r"tcp://127\.0\.0\.1:9"):
         run_study(real, tmp_path / "out", cluster="tcp://127.0.0.1:9")
     assert not (tmp_path / "out").exists()

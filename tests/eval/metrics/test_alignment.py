@@ -1,13 +1,21 @@
-"""Two maps of one track laid on each other, from wherever each drive has begun."""
+"""Two maps of one track: laid on each other, and where they differ."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.metrics.alignment import aligned_distance, maps_apart, shape_rmse
+from pathspace_graph.eval.metrics.alignment import (
+    DIFFERENT,
+    aligned_distance,
+    differences,
+    maps_apart,
+    shape_rmse,
+)
 from pathspace_graph.factors.se2 import inverse, move_points, wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import NO_COVARIANCE, Map, PointBoundary, SplineBoundary
@@ -15,6 +23,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.knots import fit_spline
 
 from ...scenes.drives import bean_track
+from ...scenes.maps import boundary, circle, ring_map
 
 Array = NDArray[np.float64]
 
@@ -77,3 +86,26 @@ def test_maps_without_a_common_boundary_are_refused() -> None:
     assert aligned_distance(left, right) == np.inf
     with pytest.raises(SettingsError, match="expected a boundary that both have, found none"):
         maps_apart(left, right)
+
+
+def test_a_map_does_not_differ_from_itself() -> None:
+    assert differences(ring_map(), ring_map()) == []
+
+
+def test_a_bulge_is_told_with_its_place_length_and_distance() -> None:
+    """The left circle of 18 m has a bulge of 2 m inwards at (-18, 0)."""
+    known, round_one = ring_map(), circle(18.0, 60)
+    points = round_one.distinct_control_points.copy()
+    angle = np.arctan2(points[:, 1], -points[:, 0])  # from the negative x axis
+    points *= (1.0 - 2.0 / 18.0 * np.exp(-0.5 * (angle / 0.15) ** 2))[:, None]
+    bulged = type(round_one).periodic_from(round_one.breaks, points)
+    found = replace(known, boundaries={**known.boundaries, LEFT: boundary(bulged)})
+    (one,) = differences(known, found)
+    assert one.boundary == "left"
+    assert one.x == pytest.approx(-16.0, abs=0.2)
+    assert one.y == pytest.approx(0.0, abs=0.3)
+    assert one.distance == pytest.approx(1.86, abs=0.02)  # a control point of 2 m
+    half = 0.15 * np.sqrt(2.0 * np.log(2.0 / DIFFERENT)) * 17.0
+    assert one.length == pytest.approx(2.0 * half, abs=1.5)
+    off, place = f"{one.distance:.2f} m from the known map", f"at x = {one.x:.1f} m, y = {one.y:.1f} m"
+    assert one.line == f"the left boundary is up to {off} on {one.length:.0f} m, {place}"

@@ -1,20 +1,204 @@
-"""Where a recording cannot be opened, one line says why, and nothing is left behind."""
+"""The recording of a run: what is shown, and what of the run it leaves as it is."""
 
 from __future__ import annotations
 
 import sys
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 
 from pathspace_graph.cli import main
 from pathspace_graph.errors import OutputError, SettingsError
+from pathspace_graph.estimators import make_online
+from pathspace_graph.eval.view import recording as entities
 from pathspace_graph.eval.view import recording as module
-from pathspace_graph.eval.view.recording import DISPLAYS, check_recording, has_display, recording
+from pathspace_graph.eval.view.recording import (
+    DISPLAYS,
+    check_recording,
+    dashes,
+    has_display,
+    pale,
+    recording,
+)
+from pathspace_graph.io.log import Log
 from pathspace_graph.io.log_files import write_log
+from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.run import run_online
+from pathspace_graph.settings.mapper import MapperSettings
 
 from ...scenes.drives import ahead, corridor, exact_log
+from .conftest import BAND_EVERY, OrangeMapper, Watched
+
+Rows = dict[str, dict[int, dict[str, Any]]]
+
+
+def read(file: Any) -> Rows:
+    """What was recorded, by path, cycle and component; what is for all times has the cycle -1."""
+    rows: Rows = defaultdict(lambda: defaultdict(dict))
+    for chunk in RrdReader(file).stream():
+        table = chunk.to_record_batch().to_pydict()
+        cycles = table.get(entities.TIMELINE, [-1] * chunk.num_rows)
+        for name, column in table.items():
+            for cycle, value in zip(cycles, column, strict=True):
+                if value is not None:
+                    rows[chunk.entity_path.strip("/")][cycle][name] = value
+    return rows
+
+
+@pytest.fixture(scope="module")
+def rows(run: Watched) -> Rows:
+    return read(run.rrd)
+
+
+def of(rows: Rows, path: str, component: str) -> dict[int, Any]:
+    """A component of an entity by cycle."""
+    return {cycle: row[component] for cycle, row in rows[path].items() if component in row}
+
+
+def test_watching_a_run_changes_nothing_to_the_bit(run: Watched) -> None:
+    np.testing.assert_array_equal(run.watched.trajectory, run.alone.trajectory)
+    assert run.alone.map.closed
+    for label, boundary in run.alone.map.boundaries.items():
+        other = run.watched.map.boundaries[label]
+        np.testing.assert_array_equal(other.spline.control_points, boundary.spline.control_points)
+        np.testing.assert_array_equal(other.covariance, boundary.covariance)
+
+
+def test_every_cycle_has_its_figures(rows: Rows, run: Watched) -> None:
+    count = len(run.log.cycles)
+    for path, expected in {
+        f"{entities.SIZES}/left": [r.size_left for r in run.watched.cycles],
+        f"{entities.SIZES}/right": [r.size_right for r in run.watched.cycles],
+        f"{entities.READING_COUNTS}/offered": [r.offered for r in run.watched.cycles],
+        f"{entities.READING_COUNTS}/used": [r.readings for r in run.watched.cycles],
+        f"{entities.UPDATE}/milliseconds": [1e3 * r.seconds for r in run.watched.cycles],
+    }.items():
+        found = of(rows, path, "Scalars:scalars")
+        assert sorted(found) == list(range(count))
+        assert [found[cycle][0] for cycle in range(count)] == pytest.approx(expected)
+
+
+def test_the_time_of_the_log_is_a_timeline(run: Watched) -> None:
+    stamps = {}
+    for chunk in RrdReader(run.rrd).stream():
+        if chunk.entity_path.strip("/") == entities.VEHICLE and not chunk.is_static:
+            assert set(chunk.timeline_names) == set(entities.TIMELINES)
+            table = chunk.to_record_batch().to_pydict()
+            stamps |= dict(zip(table[entities.TIMELINE], table[entities.TIME], strict=True))
+    seconds = [stamps[cycle].total_seconds() for cycle in range(len(run.log.cycles))]
+    assert seconds == pytest.approx([cycle.t for cycle in run.log.cycles], abs=1e-6)
+
+
+def test_readings_used_and_gated_add_up_and_have_their_feet(rows: Rows, run: Watched) -> None:
+    used, gated = (
+        of(rows, f"{entities.READINGS}/{name}", "Points2D:positions") for name in ("used", "gated")
+    )
+    feet = of(rows, entities.FEET, "LineStrips2D:strips")
+    for record in run.watched.cycles:
+        assert len(used[record.cycle]) == len(feet[record.cycle]) == record.readings
+        assert len(used[record.cycle]) + len(gated[record.cycle]) == record.offered
+
+
+def test_vehicle_trajectory_and_window_follow_the_run(rows: Rows, run: Watched) -> None:
+    way = of(rows, entities.TRAJECTORY, "LineStrips2D:strips")
+    ends = np.array([way[cycle][0][1] for cycle in range(len(run.watched.trajectory))])
+    np.testing.assert_allclose(ends, run.watched.trajectory[:, :2], atol=1e-4)  # of single precision
+    window = of(rows, entities.WINDOW, "LineStrips2D:strips")
+    assert [len(window[cycle][0]) for cycle in range(len(run.window))] == run.window
+    assert sorted(of(rows, entities.VEHICLE, "LineStrips2D:strips")) == list(range(len(run.window)))
+
+
+def test_curves_are_there_in_every_cycle_and_bands_in_some(rows: Rows, run: Watched) -> None:
+    replaced = {r.cycle for r in run.watched.cycles if r.jump is not None}
+    closing = next(r.cycle for r in run.watched.cycles if r.closed)
+    last = len(run.log.cycles) - 1
+    for label, name in ((LEFT, "left"), (RIGHT, "right")):
+        curve = of(rows, f"{entities.MAP}/{name}/curve", "LineStrips2D:strips")
+        assert sorted(curve) == list(range(min(curve), last + 1))
+        band = of(rows, f"{entities.MAP}/{name}/band", "LineStrips2D:strips")
+        regular = {cycle for cycle in curve if cycle % BAND_EVERY == 0}
+        assert set(band) == regular | replaced | {closing}
+        assert {len(edges) for edges in band.values()} == {2}
+        tentative = of(rows, f"{entities.MAP}/{name}/tentative", "LineStrips2D:strips")
+        assert any(tentative[cycle] for cycle in curve if cycle < closing)
+        assert not any(tentative[cycle] for cycle in curve if cycle >= closing)
+        final = run.watched.map.boundaries[label].spline
+        away = np.linalg.norm(final.foot_points(np.array(curve[last][0])).position - curve[last][0], axis=1)
+        assert away.max() < 1e-3
+        points = of(rows, f"{entities.MAP}/{name}/points", "Points2D:positions")[last]
+        np.testing.assert_allclose(points, final.distinct_control_points, atol=1e-4)
+
+
+def test_health_and_what_happened_is_told(rows: Rows, run: Watched) -> None:
+    states = of(rows, entities.HEALTH, "StateChange:state")
+    expected, last = {}, ""
+    for record in run.watched.cycles:
+        if record.health != last:
+            expected[record.cycle] = [record.health]
+        last = record.health
+    assert states == expected
+    closing = next(r.cycle for r in run.watched.cycles if r.closed)
+    texts = [text[0] for text in of(rows, entities.MESSAGES, "TextLog:text").values()]
+    closed = f"the loop is closed, on {run.watched.map.size} points; the pose has jumped by "
+    assert sum(text.startswith(closed) for text in texts) == 1
+    assert closing in rows[entities.MESSAGES]
+
+
+def test_true_cones_and_the_arrangement_are_in_the_file(rows: Rows, run: Watched) -> None:
+    assert run.log.truth is not None
+    cones = of(rows, entities.TRUE_CONES, "Points2D:positions")[-1]
+    np.testing.assert_allclose(cones, run.log.truth.cones, atol=1e-4)
+    assert len(RrdReader(run.rrd).recordings()) == 1
+    assert len(RrdReader(run.rrd).blueprints()) == 1
+
+
+@pytest.fixture(scope="module")
+def corridor_log() -> Log:
+    return exact_log(ahead(8.0, 2.0), *corridor(40.0))
+
+
+@pytest.mark.parametrize("name", ["landmark-fixed-lag", "ckf", "landmark-ckf"])
+def test_every_online_estimator_is_shown_as_far_as_it_says_something(
+    name: str, corridor_log: Log, tmp_path: Any
+) -> None:
+    with recording(tmp_path / "a.rrd") as recorder:
+        result = run_online(
+            corridor_log, make_online(name, MapperSettings(), corridor_log), observers=[recorder]
+        )
+    rows, last = read(tmp_path / "a.rrd"), len(corridor_log.cycles) - 1
+    for boundary, side in ((result.map.boundaries[LEFT], "left"), (result.map.boundaries[RIGHT], "right")):
+        points = of(rows, f"{entities.MAP}/{side}/points", "Points2D:positions")[last]
+        assert len(points) == boundary.size
+        assert of(rows, f"{entities.MAP}/{side}/band", "LineStrips2D:strips")
+    kind = "used" if name.endswith("fixed-lag") else "detected"
+    assert of(rows, f"{entities.READINGS}/{kind}", "Points2D:positions")[last]
+    assert (last in rows[entities.WINDOW]) == name.endswith("fixed-lag")
+
+
+def test_orange_cones_are_shown_in_every_cycle(corridor_log: Log, tmp_path: Any) -> None:
+    with recording(tmp_path / "a.rrd") as recorder:
+        mapper = OrangeMapper(odometry_sigma=corridor_log.odometry_sigma)
+        run_online(corridor_log, mapper, observers=[recorder])
+    shown = of(read(tmp_path / "a.rrd"), f"{entities.MAP}/orange/points", "Points2D:positions")
+    assert set(range(len(corridor_log.cycles))) <= set(shown)
+    np.testing.assert_allclose(shown[0], OrangeMapper.cones)
+
+
+def test_dashes_are_every_other_piece() -> None:
+    points = np.arange(10.0).reshape(5, 2)
+    first, second = dashes(points)
+    assert first.tolist() == [[0.0, 1.0], [2.0, 3.0]]
+    assert second.tolist() == [[4.0, 5.0], [6.0, 7.0]]
+    assert dashes(points[:1]) == dashes(points[:0]) == []
+
+
+def test_a_pale_colour_is_half_way_to_white() -> None:
+    assert pale("#000000") == "#808080"
+    assert pale("#ffffff") == "#ffffff"
 
 
 @pytest.fixture
