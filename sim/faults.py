@@ -157,7 +157,11 @@ def _wheel_twists(driven: Drive, faults: OdometryFaults) -> Array:
         slips = (since < faults.slip_time) & (driven.t >= faults.slip_every)
         twists *= 1.0 + faults.slip * slips[:, None] * np.array([1.0, 1.0, 0.0])
     if faults.dead_band:
-        twists[_is_pulling_off(driven.twists, faults.dead_band)] = 0.0
+        true, row = driven.twists, np.arange(len(twists))
+        stood = np.maximum.accumulate(np.where(true.any(axis=1), -1, row))
+        faster = np.hypot(true[:, 0], true[:, 1]) > faults.dead_band
+        is_pulling_off = (stood >= 0) & (np.maximum.accumulate(np.where(faster, row, -1)) <= stood)
+        twists[is_pulling_off] = 0.0
     if faults.false_travel:
         stand = np.flatnonzero(driven.twists.any(axis=1))[-1] + 1
         slow = np.flatnonzero(driven.twists[:stand, 0] > faults.false_travel)[-1:] + 1
@@ -165,14 +169,6 @@ def _wheel_twists(driven: Drive, faults: OdometryFaults) -> Array:
         end = stand + round(faults.false_travel_time / dt)
         twists[int(np.append(slow, stand)[0]) : end, 0] = faults.false_travel
     return twists
-
-
-def _is_pulling_off(twists: Array, speed: float) -> NDArray[np.bool_]:
-    """Whether the vehicle has been below a speed (m/s) since it last stood (N,), from true twists (N, 3)."""
-    row = np.arange(len(twists))
-    stood = np.maximum.accumulate(np.where(twists.any(axis=1), -1, row))
-    faster = np.maximum.accumulate(np.where(np.hypot(twists[:, 0], twists[:, 1]) > speed, row, -1))
-    return np.asarray((stood >= 0) & (faster <= stood))
 
 
 def colours(track: Track, wrong_way: bool) -> IntArray:

@@ -82,14 +82,12 @@ def as_lines(track: Track) -> Track:
     """Replace the cones of a track by points of smooth curves through them."""
     if track.path is not None:
         raise SettingsError(f"line.spacing: expected a track between two boundaries, found the {track.name}")
-    left, right = (_true_points(row, track.closed) for row in (track.left, track.right))
-    return replace(track, left=left, right=right, other=np.zeros((0, 2)), other_labels=None)
-
-
-def _true_points(cones: Array, closed: bool) -> Array:
-    curve = BoundaryCurve(cones, closed)
-    count = int(np.ceil(curve.length / TRUE_SPACING))
-    return curve.points(np.linspace(0.0, curve.length, count + 1)[: count + (not closed)])
+    rows = []
+    for cones in (track.left, track.right):
+        curve = BoundaryCurve(cones, track.closed)
+        count = int(np.ceil(curve.length / TRUE_SPACING))
+        rows.append(curve.points(np.linspace(0.0, curve.length, count + 1)[: count + (not track.closed)]))
+    return replace(track, left=rows[0], right=rows[1], other=np.zeros((0, 2)), other_labels=None)
 
 
 class LineSensor:
@@ -122,7 +120,9 @@ class LineSensor:
         settings = self._settings
         ranges, bearings, labels, nearest, normals = self._detect_lines(pose, scale, bias)
         found = polar_detections(t, ranges, bearings, labels, settings)
-        scatter = self._line.sigma_across * normals @ _to_vehicle(pose[2])
+        ahead = direction(pose[2])
+        vehicle = np.column_stack([ahead, left_normals(ahead)])  # turns rows of the map frame into it
+        scatter = self._line.sigma_across * normals @ vehicle
         found = replace(found, covariances=found.covariances + scatter[:, :, None] * scatter[:, None, :])
         ranges, bearings, labels, none = false_positives(settings, self._false_rng)
         found = found.with_others(polar_detections(t, ranges, bearings, labels, settings))
@@ -162,9 +162,3 @@ class LineSensor:
             drawn.append((curve.points(s), curve.normals(s), nearest + side * self._counts[0]))
         points, normals, index = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
         return points, normals, index
-
-
-def _to_vehicle(theta: float) -> Array:
-    """Matrix (2, 2) by which rows of vectors in the map frame turn into the vehicle's."""
-    ahead = direction(theta)
-    return np.column_stack([ahead, left_normals(ahead)])

@@ -220,12 +220,15 @@ def _chicane(along: Array, length: float, rng: Generator) -> Array:
 
 
 def _keeps_rules(curve: Array, width: float, settings: TrackGeneratorSettings) -> bool:
-    bend = np.abs(_curvature(curve))
+    bend, distance = np.abs(_curvature(curve)), width + settings.separation
+    pairs = scipy.spatial.KDTree(curve).query_pairs(distance, output_type="ndarray")
+    apart = np.abs(pairs[:, 0] - pairs[:, 1])
+    apart = np.minimum(apart, len(curve) - apart) * curves.STEP  # samples that are near are of one stretch
     return bool(
         settings.lap_length[0] <= arc_lengths(ring(curve))[-1] <= settings.lap_length[1]
         and bend.max() * _least_radius(width) <= 1
         and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * curves.STEP <= STRAIGHT_MAX
-        and _is_separate(curve, width + settings.separation)
+        and (apart < np.pi * distance / 2).all()
     )
 
 
@@ -241,14 +244,6 @@ def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
     gaps = np.diff(bad, append=bad[0] + len(good)) - 1
     longest = int(np.argmax(gaps))
     return int(bad[longest] + 1) % len(good), int(gaps[longest])
-
-
-def _is_separate(curve: Array, distance: float) -> bool:
-    """Whether samples nearer than `distance` are of one stretch, apart by less than half a circle."""
-    pairs = scipy.spatial.KDTree(curve).query_pairs(distance, output_type="ndarray")
-    apart = np.abs(pairs[:, 0] - pairs[:, 1])
-    apart = np.minimum(apart, len(curve) - apart) * curves.STEP
-    return bool((apart < np.pi * distance / 2).all())
 
 
 def _with_cones(curve: Array, width: float, settings: TrackGeneratorSettings, rng: Generator) -> Track:

@@ -1,10 +1,13 @@
-"""`demo` and `compare`: two estimators on a simulated track, or every one on logs, and the paper's table."""
+"""`demo` and `compare`: estimators on a simulated track or on logs, or two maps, side by side."""
 
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 from joblib import Parallel, delayed
+from rich.table import Table
+from rich.text import Text
 
 from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
@@ -12,24 +15,27 @@ from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
 from pathspace_graph.eval.experiment import compare as experiment
 from pathspace_graph.eval.experiment.compare import Comparison, compare, side_by_side
 from pathspace_graph.eval.experiment.run import check_jobs, run_estimator, unfinished, workers
-from pathspace_graph.eval.figures.map_plot import plot_map
+from pathspace_graph.eval.figures.map_plot import plot_apart, plot_map
 from pathspace_graph.eval.figures.style import save_plot
+from pathspace_graph.eval.metrics.alignment import maps_apart
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
-from pathspace_graph.io.files import atomic_folder, check_target
+from pathspace_graph.io.files import atomic_folder, check_target, write_json
 from pathspace_graph.io.log_files import write_log
+from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import write_result
 from pathspace_graph.options.map import Demo
 from pathspace_graph.options.study import Compare
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from .estimate import map_online, outline, tell
-from .maps import compare_maps
 from .outcome import Outcome
 from .simulate import describe, generated_track
 
 RIVAL: Final = "landmark-fixed-lag"  # estimator whose table stands beside the spline graph's in the demo
 PICTURE: Final = "track.png"
 PICTURE_DPI: Final = 150.0  # resolution of the picture, dots per inch, which suits a web page
+APART_FILE: Final = "apart.json"  # by which the folder is recognized
+STATISTICS: Final = ("mean", "rms", "p95", "max")
 
 
 def compare_command(options: Compare) -> Outcome:
@@ -65,6 +71,28 @@ def report(out: Path, comparison: Comparison) -> Outcome:
 
 def _name(names: Mapping[str, str]) -> str:
     return f"{names['estimator']} on {names['log']}"
+
+
+def compare_maps(first: Path, second: Path, out: Path, *, force: bool) -> Outcome:
+    """Align the first map with the second, print and write their distances, and draw both."""
+    check_target(out, APART_FILE, force=force)
+    tracks = read_map(first), read_map(second)
+    apart = maps_apart(*tracks)
+    content = {"maps": [str(first), str(second)], **apart.to_json()}
+    with atomic_folder(out, APART_FILE, force=force) as folder:
+        write_json(folder / APART_FILE, content)
+        save_plot(plot_apart(*tracks, apart), folder / "apart.png")
+    table = Table()
+    table.add_column("boundary")
+    for name in STATISTICS:
+        table.add_column(Text(f"{name} [m]"), justify="right")  # a plain text would be markup
+    for name, own in apart.statistics().items():
+        table.add_row(name, *(f"{own[key]:.3f}" for key in STATISTICS))
+    output().print(table)
+    x, y, turn = apart.motion.tolist()
+    where = f"({x:.3f}, {y:.3f}) m, turned by {np.rad2deg(turn):.3f}°"
+    say(f"the frame of {first} is at {where} in that of {second}")
+    return Outcome([out], content)
 
 
 def demo_command(options: Demo) -> Outcome:

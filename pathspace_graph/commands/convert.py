@@ -1,7 +1,6 @@
 """`convert`: a ROS bag, CSV files or JSON lines as a log."""
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -25,7 +24,7 @@ from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.options.data import Convert
 from pathspace_graph.plausibility.diagnosis import measured_line
-from pathspace_graph.plausibility.hint import Hint, because
+from pathspace_graph.plausibility.hint import because
 from pathspace_graph.plausibility.judge import hints
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
@@ -98,7 +97,11 @@ def _convert(options: Convert, source: Path, out: Path) -> None:
         log = with_measured_noise(replace(recorded, scale=options.scale), record.parts)
         write_checked(log, out, source, force=options.force)
     report(record.notes, rule, log)
-    tell(_with_units(hints(log)) if options.kind == "csv" else hints(log))
+    found, mends = hints(log), UNITS_OPTION if options.kind == "csv" else {}
+    for number, hint in enumerate(found):
+        if hint.cause in mends:
+            found[number] = replace(hint, advice=f"{hint.advice} ({mends[hint.cause]})")
+    tell(found)
 
 
 def _read(options: Convert, source: Path, rule: LabelRule) -> Recording:
@@ -117,16 +120,6 @@ def _read(options: Convert, source: Path, rule: LabelRule) -> Recording:
             held=topics.held,
         )
     return read_bag(source, options.topics, rule, mounted=options.frames.mounting is not None)
-
-
-def _with_units(found: Sequence[Hint]) -> list[Hint]:
-    """Name the option that states a unit beside each hint at a wrong one."""
-    return [
-        replace(hint, advice=f"{hint.advice} ({UNITS_OPTION[hint.cause]})")
-        if hint.cause in UNITS_OPTION
-        else hint
-        for hint in found
-    ]
 
 
 def with_measured_noise(log: Log, parts: int = 1) -> Log:

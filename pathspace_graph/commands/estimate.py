@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from itertools import count
 from pathlib import Path
@@ -15,21 +15,23 @@ from rich.text import Text
 
 from pathspace_graph import estimators
 from pathspace_graph.batch.joint_mapper import JointResult, solve_together
+from pathspace_graph.batch.known_map import map_of_cones
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
+from pathspace_graph.eval.metrics.alignment import MapDifference, differences
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.map import MAP_FILE, Map
+from pathspace_graph.io.map import MAP_FILE, Map, as_ribbon, read_map
 from pathspace_graph.io.overrides import override
 from pathspace_graph.io.results import BatchRun, RunResult, write_result
-from pathspace_graph.io.ribbon import as_ribbon
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -39,12 +41,57 @@ from pathspace_graph.plausibility.hint import Hint, objections
 from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.run import Observer, OnlineEstimator, run_online, with_own
 from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.track import EVENTS
+from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.spline.crossing import crossings_told
 
-from .known import KnownTrack, read_known_map
 from .outcome import Outcome
 
 Run = TypeVar("Run", bound=RunResult)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownTrack:
+    """A map that is known before the drive."""
+
+    path: Path
+    map: Map
+    start: Array | None  # pose (3,) at the begin of an open one (m, m, rad), map frame; None of a closed one
+
+    def found_at(self, estimator: OnlineEstimator) -> float | None:
+        """Stamp (s) at which the vehicle was found on the map, if it was."""
+        return estimator.placed_at if isinstance(estimator, FixedLagMapper) else None
+
+    def differences(self, result: RunResult, estimator: OnlineEstimator) -> list[MapDifference]:
+        """Changes of the track against the known map, once the vehicle was found on it."""
+        if self.found_at(estimator) is None:
+            return []
+        found = differences(scaled(self.map, 1.0 / result.scale), result.at_scale_one().map)
+        return [scaled(one, result.scale) for one in found]
+
+    def summary(self, estimator: OnlineEstimator, differ: list[MapDifference]) -> dict[str, Any]:
+        """Entries of `summary.json` about the map."""
+        known = {"map": str(self.path), "found_at": self.found_at(estimator)}
+        return {"known_map": known, "differences": [asdict(one) for one in differ]}
+
+
+def read_known_map(path: Path, sigma: float, settings: MapperSettings) -> KnownTrack:
+    """Read the map of a folder, of a track file, or of an event of the rules.
+
+    Cones of a track file or of an event are known with a standard deviation `sigma` (m).
+    """
+    if path.is_dir() or path.name == MAP_FILE:
+        track = read_map(path)
+        return KnownTrack(path, track, None if track.closed else np.zeros(3))
+    if not path.exists() and str(path) in EVENTS:
+        drawn = EVENTS[str(path)]()
+    elif path.exists():
+        drawn = read_track(path)
+    else:
+        events = " or ".join(EVENTS)
+        raise InputError(path, f"expected a map's folder, a track file, {events}, found none")
+    track = map_of_cones(*drawn.rows, drawn.closed, sigma, settings)
+    return KnownTrack(path, track, None if drawn.closed else drawn.start)
 
 
 def online_command(options: Online) -> Outcome:

@@ -28,7 +28,9 @@ def plot_command(options: Plot) -> Outcome:
     cycles = read_cycles(options.map) if (options.map / CYCLES_FILE).exists() else {}
     look: dict[str, Any] = {"band_scale": options.band_scale, "title": options.title}
     look |= {"trajectory": trajectory, "smoothed": smoothed, "health": [*cycles.get("health", [])]}
-    look["differences"] = _differences(options.map / SUMMARY_FILE)
+    file = options.map / SUMMARY_FILE
+    differences = read_json(file, "a summary").get("differences", []) if file.exists() else []
+    look["differences"] = [(one["x"], one["y"]) for one in differences]  # from the map that was known
     save_plot(plot_map(track, log=log, **look), options.out)
     return Outcome([options.out])
 
@@ -37,9 +39,3 @@ def check_picture(file: Path) -> None:
     """Raise an error where no picture could be written, before anything is mapped."""
     check_plot_file(file)
     check_file_target(file)
-
-
-def _differences(file: Path) -> list[tuple[float, float]]:
-    """Places (m) at which a map differs from the one that was known, by its summary."""
-    summary = read_json(file, "a summary") if file.exists() else {}
-    return [(one["x"], one["y"]) for one in summary.get("differences", [])]

@@ -82,28 +82,21 @@ def rate(count: int, seconds: float) -> str:
     return f"{count / seconds:.3g} Hz" if count > 1 and seconds > SHORTEST else "an unknown rate"
 
 
-def clock_falls(t: Array) -> Array:
-    """Fall of each stamp (n,) in s where the clock was reset; elsewhere 0.
+def check_clock(t: Array, what: str, file: Path) -> None:
+    """Raise an InputError where stamps (n,) in s fall back since the clock was reset.
 
     Two messages before it and two from it on agree, unlike those of a stray stamp. Messages out of order fall
     by less than `MAX_DISORDER`.
     """
-    falls, known = np.zeros(len(t)), np.flatnonzero(np.isfinite(t))
-    of_known = t[known]
-    lowest_before = np.minimum(of_known[:-3], of_known[1:-2])
-    highest_after = np.maximum(of_known[2:-1], of_known[3:])
-    is_reset = lowest_before - highest_after > MAX_DISORDER
-    falls[known[2:-1]] = np.where(is_reset, of_known[1:-2] - of_known[2:-1], 0.0)
-    return falls
-
-
-def check_clock(t: Array, what: str, file: Path) -> None:
-    """Raise an InputError where stamps (n,) in s fall back."""
-    falls = clock_falls(t)
-    if falls.any():
-        at = int(np.argmax(falls > 0.0))
-        fall = f"the stamps fall back by {falls[at]:.3g} s at message {at + 1}"
-        found = f"found that {fall}, from {t[at] + falls[at]:.12g} s to {t[at]:.12g} s: was the clock reset?"
+    known = np.flatnonzero(np.isfinite(t))
+    stamps = t[known]
+    lowest_before = np.minimum(stamps[:-3], stamps[1:-2])
+    highest_after = np.maximum(stamps[2:-1], stamps[3:])
+    resets = np.flatnonzero(lowest_before - highest_after > MAX_DISORDER) + 2
+    if len(resets):
+        before, after = stamps[resets[0] - 1], stamps[resets[0]]
+        fall = f"the stamps fall back by {before - after:.3g} s at message {known[resets[0]] + 1}"
+        found = f"found that {fall}, from {before:.12g} s to {after:.12g} s: was the clock reset?"
         way_out = "--start and --end take a part, --received takes the times of receipt"
         raise InputError(file, f"expected {what} by one clock, {found} {way_out}")
 
@@ -119,21 +112,15 @@ def strays(t: Array) -> BoolArray:
     return np.asarray((apart > far) & (np.abs(before - after) <= far))
 
 
-def without_strays(record: Recording) -> Recording:
-    """Leave out what has a stamp far from those around it, as a first message of a clock that isn't set."""
+def windowed(record: Recording, window: Window, file: Path) -> Recording:
+    """Cut a record to the window, without stamps as of a first message of a clock that isn't set."""
     of_odometry, of_scans, notes = strays(record.t), strays(record.scan_t), record.notes
+    far = "have a stamp far from those around them, and were left out"
     if of_odometry.any():
         where = record.at(record.numbers[of_odometry])
-        far = "odometry samples have a stamp far from those around them, and were left out"
-        notes[f"{far}: {where}"] += int(of_odometry.sum())
-    far = "messages with detections have a stamp far from those around them, and were left out"
-    notes[far] += int(of_scans.sum())
-    return record.chosen(~of_odometry, ~of_scans)
-
-
-def windowed(record: Recording, window: Window, file: Path) -> Recording:
-    """Cut a record to the window."""
-    record, notes, most = without_strays(record), record.notes, window.range_max
+        notes[f"odometry samples {far}: {where}"] += int(of_odometry.sum())
+    notes[f"messages with detections {far}"] += int(of_scans.sum())
+    record, most = record.chosen(~of_odometry, ~of_scans), window.range_max
     if most is not None:
         with np.errstate(over="ignore"):
             near = np.hypot(*record.points.points.T) <= most

@@ -1,5 +1,6 @@
 """The folder of a log: header, tables and, where known, the truth (FORMATS)."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 from msgspec.structs import asdict
 
 from pathspace_graph.errors import InputError, check_type
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.labels import NAMES
 
 from . import header as headers
@@ -69,18 +70,16 @@ def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) ->
         return None
     poses, cones, table = (_table(folder, name) for name in TRUTH_FILES)
     t, placed, points = increasing_times(poses), poses.stack(("x", "y", "theta")), cones.stack(("x", "y"))
-    associations = _associations(table, detection_count, len(points)) if known[-1] else None
-    return Truth(t, placed, points, labels_of(cones), associations, **errors)
-
-
-def _associations(table: Table, detection_count: int, cone_count: int) -> IntArray:
+    truth = Truth(t, placed, points, labels_of(cones), None, **errors)
+    if not known[-1]:
+        return truth
     if len(table) != detection_count:
         expected = f"a row for each of {detection_count} detections"
         raise InputError(table.file, f"expected {expected}, found {len(table)}")
-    cones = table.numbers("cone")
-    good = (cones == np.floor(cones)) & (cones >= -1) & (cones < cone_count)
-    table.require(good, f"expected -1 or the index of one of {cone_count} true cones")
-    return cones.astype(int)
+    index = table.numbers("cone")
+    good = (index == np.floor(index)) & (index >= -1) & (index < len(points))
+    table.require(good, f"expected -1 or the index of one of {len(points)} true cones")
+    return replace(truth, associations=index.astype(int))
 
 
 def write_log(log: Log, folder: Path | str, *, check: bool = False, force: bool = False) -> None:

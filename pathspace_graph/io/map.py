@@ -17,6 +17,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import move_points, rotation
 from pathspace_graph.labels import BOUNDARIES, LABELS, LEFT, NAMES, RIGHT
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.centre_line import Ribbon, find_line
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
 from .brief import Brief, pictures
@@ -361,3 +362,49 @@ def read_map(folder: Path | str) -> Map:
     """Read the map of a folder that follows FORMATS, or of its map file."""
     file = Path(folder) if Path(folder).is_file() else Path(folder) / MAP_FILE
     return map_from_json(read_json(file, "a map"), file)
+
+
+# --- one centre line with a width ------------------------------------------------------------------------
+
+
+def as_ribbon(track: Map, sigma_shape: float) -> Map:
+    """Replace the boundaries of a map by the edges of its ribbon; SettingsError where none fits.
+
+    `sigma_shape` (m) is what a ribbon cannot follow, one sigma, added to each control point of its edges.
+    """
+    ribbon, covariance, until = ribbon_of(track)
+    return replace(map_of(ribbon, covariance, sigma_shape, until), points=track.points)
+
+
+def ribbon_of(track: Map) -> tuple[Ribbon, Array | None, dict[int, float]]:
+    """Fit the ribbon between the boundaries of a map; SettingsError where none fits.
+
+    With it come its covariance (3m, 3m), if known, and the parameter up to which each open edge is confirmed.
+    """
+    curves = {label: track.curve(label, "a centre line") for label in BOUNDARIES}
+    P = track.covariance_of(*curves.values())
+    left, right = (curve.spline for curve in curves.values())
+    line, until = find_line(left, right), {}
+    for side, (label, curve) in enumerate(curves.items()):
+        if not left.periodic:
+            end = np.array([min(curve.confirmed_until, curve.spline.domain[1])])
+            until[label] = float(line.ribbon_parameters(side, end)[0])
+    return line.ribbon, None if P is None else line.by_boundaries @ P @ line.by_boundaries.T, until
+
+
+def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]) -> Map:
+    """Build the map of the edges of a ribbon, with the covariance (3m, 3m) of its control points, if known.
+
+    `sigma_shape` (m) is added to each control point. Open edges are confirmed up to the parameters `until`.
+    """
+    edges, joint, at = {label: ribbon.edge_spline(label) for label in BOUNDARIES}, None, 0
+    if covariance is not None:
+        by_ribbon = np.concatenate([jacobian for _, jacobian in edges.values()])
+        joint = by_ribbon @ covariance @ by_ribbon.T
+        joint = 0.5 * (joint + joint.T) + sigma_shape**2 * np.eye(len(joint))
+    boundaries = {}
+    for label, (spline, jacobian) in edges.items():
+        block = slice(at, at := at + len(jacobian))
+        own = NO_COVARIANCE if joint is None else joint[block, block].copy()
+        boundaries[label] = SplineBoundary(spline, own, until.get(label, spline.domain[1]))
+    return Map(ribbon.periodic, boundaries, joint)

@@ -11,7 +11,7 @@ from pathspace_graph.convert.settings import BagOptions, Frames, NoiseSettings, 
 from pathspace_graph.sim.simulate import PRESETS, SimulationSettings, preset
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings
 
-from .command import INLINE, FolderCommand
+from .map import INLINE, FolderCommand
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,8 +7,7 @@ from typing import Annotated
 from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
 from pathspace_graph.settings.evaluation import ScalingSettings
 
-from .command import Command, FolderCommand, suggest
-from .map import Estimation
+from .map import Command, Estimation, FolderCommand, suggest
 
 EVERY = (*ONLINE_NAMES, *BATCH_NAMES)
 STUDIES = tuple(sorted(file.stem for file in (Path(__file__).parents[1] / "eval" / "studies").glob("*.toml")))

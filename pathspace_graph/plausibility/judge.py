@@ -47,8 +47,9 @@ def hints(log: Log) -> list[Hint]:
     if of_parts := parts_of_stamps(log):
         return of_parts
     log, found = stamps_in_seconds(log)
-    if of_clocks := one_clock(log):
-        return found + of_clocks
+    t, stamps = log.odometry.t, [cycle.t for cycle in log.cycles] or [float(log.odometry.t[0])]
+    if stamps[0] > t[-1] or stamps[-1] < t[0]:
+        return [*found, hint_of("two clocks", begin=stamps[0], end=stamps[-1], first=t[0], last=t[-1])]
     log = log.at_scale_one()
     of_cycles = gaps_and_reach(log)
     log, of_positions = positions_in_metres(log)
@@ -107,12 +108,6 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
     odometry = replace(log.odometry, t=log.odometry.t * sizes[ODOMETRY_FILE])
     cycles = tuple(replace(cycle, t=cycle.t * sizes[DETECTIONS_FILE]) for cycle in log.cycles)
     return replace(log, odometry=odometry, cycles=cycles), found
-
-
-def one_clock(log: Log) -> list[Hint]:
-    t, stamps = log.odometry.t, [cycle.t for cycle in log.cycles] or [float(log.odometry.t[0])]
-    apart = stamps[0] > t[-1] or stamps[-1] < t[0]
-    return [hint_of("two clocks", begin=stamps[0], end=stamps[-1], first=t[0], last=t[-1])] if apart else []
 
 
 def gaps_and_reach(log: Log) -> list[Hint]:

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose, move_points, relative
 from pathspace_graph.io.log import Detections, Log
@@ -46,7 +46,9 @@ def is_line(log: Log) -> bool | None:
         if len(odometry.t):
             held = np.diff(np.append(odometry.t, detections.t))
             pose = compose(pose, integrate_twists(held, odometry.twist, np.zeros(3)).delta)
-        side = _side_of(detections)
+        side = detections.labels  # or of the vehicle, where no detection has a label
+        if (side == UNKNOWN).all():
+            side = np.where(detections.points_vehicle[:, 1] > 0.0, LEFT, RIGHT)
         for label in BOUNDARIES:
             own = detections.where(side == label)
             points, sigmas = _nearest(own)
@@ -74,13 +76,6 @@ def is_line(log: Log) -> bool | None:
     if np.median(away) < CONES:
         return False
     return True if np.median(away) > LINE and np.median(across) < ON_LINE else None
-
-
-def _side_of(detections: Detections) -> IntArray:
-    """Return the boundary (m,) of each detection: its label or, if no one has a label, the vehicle's side."""
-    if (detections.labels != UNKNOWN).any():
-        return detections.labels
-    return np.where(detections.points_vehicle[:, 1] > 0.0, LEFT, RIGHT)
 
 
 def _nearest(detections: Detections) -> tuple[Array, Array]:

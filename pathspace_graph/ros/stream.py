@@ -76,12 +76,10 @@ class MessageStream:
         self._newest = max(self._newest, t)
         insort(self._waiting, cycle, key=lambda one: one.t)
         while self._waiting and self._waiting[0].t <= self._newest - self._wait:
-            yield self._with_twists(self._waiting.pop(0))
-
-    def _with_twists(self, cycle: Detections) -> tuple[Odometry, Detections]:
-        rows = [row for row in self._twists if row[0] <= cycle.t]
-        twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
-        return Odometry(np.array([stamp for stamp, _ in rows]), twists), cycle
+            cycle = self._waiting.pop(0)
+            rows = [row for row in self._twists if row[0] <= cycle.t]
+            twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
+            yield Odometry(np.array([stamp for stamp, _ in rows]), twists), cycle
 
     def use(self, t: float) -> None:
         """Drop the twists that a cycle at t (s) has used, except the last one, which is held."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.commands.known import read_known_map
+from pathspace_graph.commands.estimate import read_known_map
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.tables import read_trajectory

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo, Truth
+from pathspace_graph.io.log import COLUMNS, Detections, Log, Odometry, SensorInfo, Truth
 from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.parsing import MAX_HELD, MAX_RANGE
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
@@ -271,3 +271,22 @@ def test_an_array_that_is_wrong_is_named_with_its_row(changed: dict[str, Any], s
     with pytest.raises(InputError) as caught:
         Log.from_arrays(**{**good, **changed})
     assert str(caught.value).startswith(says)
+
+
+@pytest.mark.parametrize(("name", "column"), [(name, column) for name in COLUMNS for column in COLUMNS[name]])
+def test_a_missing_column_is_named(name: str, column: str, tmp_path: Path) -> None:
+    write_log(small_log(), tmp_path / "log")
+    file = tmp_path / "log" / name
+    header, rest = file.read_text().split("\n", 1)
+    renamed = ",".join("other" if word == column else word for word in header.split(","))
+    file.write_text(f"{renamed}\n{rest}")
+    with pytest.raises(InputError, match=f"{name}, row 1: expected a column '{column}'"):
+        read_log(tmp_path / "log")
+
+
+def test_a_stamp_that_both_parts_have_is_kept_once_with_the_earlier_twist() -> None:
+    stamps = np.array([0.0, 0.1, 0.2])
+    first, second = Odometry(stamps, np.ones((3, 3))), Odometry(stamps + 0.2, np.full((3, 3), 2.0))
+    both = first.followed_by(second)
+    np.testing.assert_allclose(both.t, [0.0, 0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_array_equal(both.twist[:, 0], [1.0, 1.0, 1.0, 2.0, 2.0])

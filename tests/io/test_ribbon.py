@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.map import Map, SplineBoundary
-from pathspace_graph.io.ribbon import as_ribbon, map_of, ribbon_of
+from pathspace_graph.io.map import Map, SplineBoundary, as_ribbon, map_of, ribbon_of
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 from ..scenes.maps import SIGMA, open_map, point_map, ring_map

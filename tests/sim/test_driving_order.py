@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.sim.curves import along_path
-from pathspace_graph.sim.driving_order import driving_order
+from pathspace_graph.sim.track_files import driving_order
 
 ANGLES = np.arange(0.0, 2.0 * np.pi, np.pi / 10.0)
 START = np.array([12.0, 0.0, 0.5 * np.pi])
