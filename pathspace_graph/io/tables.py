@@ -1,6 +1,7 @@
 """CSV files and trajectories in the TUM format, read by pandas."""
 
 import re
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from io import BytesIO
 from itertools import chain
@@ -113,7 +114,7 @@ def _read_csv(file: Path, text: str, width: int, delimiter: str) -> Iterator[pd.
         zero = text.count("\n", 0, text.index("\0")) + 1
         raise InputError(file, "expected a table of texts, found a zero byte", zero)
     try:
-        for frame in pd.read_csv(
+        reader = pd.read_csv(
             BytesIO(text.encode()),
             sep=delimiter,
             header=None,
@@ -124,7 +125,13 @@ def _read_csv(file: Path, text: str, width: int, delimiter: str) -> Iterator[pd.
             skipinitialspace=True,
             skip_blank_lines=False,
             chunksize=CHUNK,
-        ):
+        )
+        while True:
+            with warnings.catch_warnings():  # of fields beyond the last one, which would be dropped
+                warnings.simplefilter("error", pd.errors.ParserWarning)
+                frame = next(reader, None)
+            if frame is None:
+                break
             begins_empty = frame[frame[0] == ""]
             kept = frame.drop(begins_empty.index[(begins_empty == "").all(axis=1)])
             for row in kept.index[kept[width - 1] == ""] if has_lines else ():
@@ -134,6 +141,11 @@ def _read_csv(file: Path, text: str, width: int, delimiter: str) -> Iterator[pd.
             yield kept.set_axis(kept.index + 1)
         if not text:
             yield pd.DataFrame(columns=range(width + 1), dtype=object)
+    except pd.errors.ParserWarning:
+        fields = r"\s+" if len(delimiter) > 1 else re.escape(delimiter)
+        rows = enumerate(re.split(r"\r\n?|\n", text), start=1)
+        long_row = next((k for k, line in rows if len(re.split(fields, line.strip())) > width), 1)
+        raise InputError(file, f"expected {width} fields, found more", long_row) from None
     except pd.errors.ParserError as error:
         told = str(error).strip()
         if long := re.search(r"in line (\d+), saw (\d+)", told):
