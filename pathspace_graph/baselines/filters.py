@@ -18,7 +18,7 @@ from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
 from pathspace_graph.places.constellation import BEGINNING, Constellation, Prior, SampledCurves, beginning_of
-from pathspace_graph.places.find import SURE_ODDS, find
+from pathspace_graph.places.find import find, sure
 from pathspace_graph.places.passes import LAP_TURNED, tried_along
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.spline.bspline import BSpline
@@ -134,10 +134,8 @@ def associate_early_segment(
     seen = Constellation.of(table, poses, state.settings.growth).seen_from(poses[-1])
     information = np.asarray(np.linalg.inv(state.belief.covariance[:POSE, :POSE]), np.float64)
     prior = tried_along(beginning, Prior(poses[-1:], information, (reach, LAP_TURNED)))
-    places = find(seen, SampledCurves.of(splines, ends), prior)
-    if not places or places[0].odds < SURE_ODDS:
-        return None
-    return compose(places[0].pose, inverse(poses[-1]))
+    place = sure(find(seen, SampledCurves.of(splines, ends), prior))
+    return None if place is None else compose(place.pose, inverse(poses[-1]))
 
 
 def update_by_correspondences(state: CurveState, motion: Array) -> bool:

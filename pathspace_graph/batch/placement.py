@@ -11,7 +11,7 @@ from pathspace_graph.factors.se2 import compose, inverse, path_lengths
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.places.constellation import Constellation, Prior
-from pathspace_graph.places.find import SURE_ODDS, KnownRoad, Place, find
+from pathspace_graph.places.find import KnownRoad, find, sure
 from pathspace_graph.places.passes import seen_in
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -66,9 +66,9 @@ def find_place(known: Driven, drive: Driven) -> Array:
         raise NotPlacedError(f"it is shorter than {LEAST_DRIVEN:g} m")
     if not known.state.closed:
         places = find(drive.seen(0.0, FROM_START), known.road.seen, Prior.about(np.zeros(3), *ABOUT_START))
-        if not _is_sure(places):
+        if (place := sure(places)) is None:
             raise NotPlacedError(OTHER_START)
-        return places[0].pose
+        return place.pose
     motion, found = _by_stretches(known.road, drive)
     if motion is not None:
         return motion
@@ -86,11 +86,7 @@ def _by_stretches(road: KnownRoad, drive: Driven) -> tuple[Array | None, bool]:
         poses = drive.state.poses[within]
         seen = drive.seen(end - PLACED_STRETCH, end).seen_from(poses[-1])
         places = find(seen, road.seen, road.along(poses))
-        if _is_sure(places):
-            return compose(places[0].pose, inverse(poses[-1])), True
+        if (place := sure(places)) is not None:
+            return compose(place.pose, inverse(poses[-1])), True
         fits |= bool(places) and places[0].odds > -np.inf
     return None, fits
-
-
-def _is_sure(places: list[Place]) -> bool:
-    return bool(places) and places[0].odds >= SURE_ODDS

@@ -21,7 +21,7 @@ from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.places.constellation import Constellation, Prior
-from pathspace_graph.places.find import SURE_ODDS, KnownRoad, Place, find
+from pathspace_graph.places.find import KnownRoad, Place, find, sure
 
 from .drive import Drive, Phase, Step
 
@@ -78,8 +78,7 @@ class Search(Copyable):
         first = int(driven.searchsorted(driven[-1] - length))
         table = DetectionColumns.of(self._seen[first:], first)
         seen = Constellation.of(table, poses, self.settings.growth, of_lines=of_lines).seen_from(poses[-1])
-        places = find(seen, self.known.seen, prior)
-        return places[0] if places and places[0].odds >= SURE_ODDS else None
+        return sure(find(seen, self.known.seen, prior))
 
 
 class Lost(Phase):

@@ -5,7 +5,7 @@ regular distances, so a few of them fit in many places. A place has log odds aga
 places, and that the vehicle is at none of them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, log
 from typing import Final, Self
@@ -86,6 +86,11 @@ def find(seen: Constellation, known: Known, prior: Prior) -> list[Place]:
         is_fit = enough[i] and misfit[i] <= FIT_MISFIT
         places.append(Place(pose, fits.information[i], 0.5 * (rival - float(costs[i])) if is_fit else -inf))
     return places
+
+
+def sure(places: Sequence[Place]) -> Place | None:
+    """Return the first of the best places if its odds are `SURE_ODDS` or more."""
+    return places[0] if places and places[0].odds >= SURE_ODDS else None
 
 
 def _best_of_others(values: Array, poses: Array, limit: float) -> float:

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import (
     compose,
     path_lengths,
@@ -22,7 +22,7 @@ from pathspace_graph.mapping.path import HEADING
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .constellation import Constellation, Prior, SampledCurves
-from .find import SURE_ODDS, Place, find
+from .find import Place, find, sure
 
 NEWEST_PATH: Final = 30.0  # length of the newest path whose cones are laid on earlier ones (m)
 BEYOND: Final = 10.0  # length by which the earlier path exceeds the newest on each side (m)
@@ -70,8 +70,8 @@ def return_to_beginning(
         return None
     place, earlier = found
     newest = to_vehicle(poses[stations > length - LAP_NEWEST, :2], poses[-1:])
-    crosses, _ = start_crossings(to_map(newest, place.pose[None]), poses[0])
-    return revisit_of(place, poses, earlier, len(poses) - 1) if crosses.any() else None
+    crosses = crosses_start(to_map(newest, place.pose[None]), poses[0])
+    return revisit_of(place, poses, earlier, len(poses) - 1) if crosses else None
 
 
 def find_return(
@@ -121,7 +121,7 @@ def newest_place(
         places = find(seen, Constellation.of(seen_in(old), poses, growth), prior)
     else:
         places = find(seen, curves, tried_along(poses[:first], prior))
-    return places[0] if places and places[0].odds >= SURE_ODDS else None
+    return sure(places)
 
 
 def tried_along(poses: Array, prior: Prior) -> Prior:
@@ -133,15 +133,12 @@ def tried_along(poses: Array, prior: Prior) -> Prior:
     return replace(prior, starts=prior.poses + off[possible])
 
 
-def start_crossings(path: Array, start: Array) -> tuple[BoolArray, Array]:
-    """Return whether steps (n - 1,) of a path (n, 2) cross the line of a start (3,), and the ends' offsets.
-
-    A crossing is in the direction of the start. Offsets (n - 1,) are in m, positive to its left.
-    """
+def crosses_start(path: Array, start: Array) -> bool:
+    """Whether a path (n, 2) crosses the line of a start (3,), in its direction."""
     ahead, left = to_vehicle(path, start[None]).T
     steps, forward = np.hypot(np.diff(ahead), np.diff(left)), np.diff(ahead)
     crosses = (ahead[:-1] <= 0.0) & (ahead[1:] > 0.0) & (np.abs(left[1:]) < START_LATERAL)
-    return crosses & (forward > np.cos(START_HEADING) * steps), left[1:]
+    return bool((crosses & (forward > np.cos(START_HEADING) * steps)).any())
 
 
 def revisit_of(place: Place, poses: Array, earlier: int, later: int) -> Revisit:
