@@ -10,7 +10,15 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import left_of, path_lengths, rotated, to_map, to_vehicle, wrap_angle
+from pathspace_graph.factors.se2 import (
+    left_of,
+    move_points,
+    path_lengths,
+    rotated,
+    to_map,
+    to_vehicle,
+    wrap_angle,
+)
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.tentative import merged_in_turn
@@ -222,9 +230,8 @@ class SampledCurves:
 
     def _rows(self, seen: Constellation, pose: Array) -> tuple[Array, Array, Array, BoolArray]:
         """Return signed distances (n,) across, derivatives (n, 3), variances (n,), and which are in view."""
-        at = np.broadcast_to(pose, (len(seen), 3))
-        points = to_map(seen.points, np.ascontiguousarray(at))
-        covariances = rotated(seen.covariances, at[:, 2])
+        points = move_points(pose, seen.points)
+        covariances = rotated(seen.covariances, np.full(len(seen), pose[2]))
         off, normal, inside = np.zeros(len(seen)), np.zeros((len(seen), 2)), np.zeros(len(seen), bool)
         for label, tree in self.trees.items():
             own = np.flatnonzero(seen.labels == label)
