@@ -30,7 +30,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 UNASSOCIATED: Final = -1  # landmark of a detection without one, which may create one
 AMBIGUOUS: Final = -2  # landmark of a detection without one, which must not create one
 SIGMA_MERGE: Final = 0.1  # standard deviation of the distance of two landmarks of one cone (m)
-NO_PAIRS: IntArray = np.zeros((0, 2), np.intp)
 
 
 class LandmarkState:
@@ -122,7 +121,6 @@ class LandmarkMap:
         self.variables = self.state.variables
         self.detections = LandmarkDetections()  # detections from the poses in the window
         self.twist: Array = np.zeros(POSE)  # (3,) at the newest detections (m/s, m/s, rad/s)
-        self.loop_pairs: IntArray = NO_PAIRS  # (k, 2) numbers of pairs with constraints while the loop closes
         self.merged_into: dict[int, int] = {}  # number of the remaining landmark, by that of the merged one
 
     def copy(self) -> Self:
@@ -153,22 +151,13 @@ class LandmarkMap:
     def linearized(self, cycles: IntArray) -> None:
         self.detections.mark_linearized()
 
-    @property
-    def structure(self) -> object:
-        return self.loop_pairs
+    structure = None  # there are no weak priors
 
     def gauge(self, whole: bool) -> list[Rows]:
         return []
 
     def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Rows `(l_i - l_j) / sigma_merge`, two for each loop pair."""
-        if len(self.loop_pairs) == 0:
-            return []
-        pairs = self.state.landmarks[self.state.positions(self.loop_pairs)]
-        axes = np.concatenate([np.eye(POINT), -np.eye(POINT)], axis=1) / SIGMA_MERGE
-        keys = np.repeat(landmark_keys(self.loop_pairs), POINT, axis=0)
-        residual = (pairs[:, 0] - pairs[:, 1]).ravel() / SIGMA_MERGE
-        return [Rows(keys, np.tile(axes, (len(pairs), 1)), residual, keys[:, 0])]
+        return []
 
     def activate(self, keys: IntArray) -> None: ...  # every landmark is always active
 
@@ -186,7 +175,6 @@ class LandmarkMap:
         stays = np.ones(len(state), bool)
         stays[gone] = False
         state.keep(stays)
-        self.loop_pairs = NO_PAIRS
         self.merged_into.update(zip(gone_numbers.tolist(), kept_numbers.tolist(), strict=True))
 
 

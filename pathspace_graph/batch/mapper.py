@@ -195,7 +195,7 @@ class BatchMapper:
             raise SettingsError("start online: expected an online mapper, found none")
         watch.lap("optimum")
         mapper = self.online(settings, noise)
-        state, online = start_online(log, mapper)
+        state, online = start_online(log, mapper, judged.settings)
         watch.lap("start")
         found = None
         if start == "auto" and not revisits:

@@ -1,4 +1,4 @@
-"""What happens to a smoother once: its loop is solved, its points become others, its prior another one."""
+"""What happens to a smoother once: its points become others, its prior another one."""
 
 from typing import Final
 
@@ -15,7 +15,6 @@ from .gaussian import (
     merge_variables,
 )
 from .inactive import InactiveMap
-from .relative import RelativeFactor
 from .smoother import FixedLagSmoother
 from .variables import pose_keys
 from .window import MapRows
@@ -25,52 +24,13 @@ Smoother = FixedLagSmoother[MapRows]
 STIFFNESS: Final = 1e4  # information about a gauge that is held, by that from measurements
 
 
-# --- the loop --------------------------------------------------------------------------------------------
-
-
-def solve_loop(smoother: Smoother, iterations: int, sigma_step: float | None) -> dict[int, Array]:
-    """Optimize the whole drive on its submaps, each relinearized in its own frame.
-
-    Return the poses (3,) of the keyframes by cycle. Without submaps, since a user's factors are absolute, the
-    prior keeps its linearization point, and there are no keyframes.
-    """
-    smoother.reactivate(with_prior=smoother.submaps is None)
-    submaps, smoother.submaps = smoother.submaps, None
-    if submaps is not None:
-        submaps.finish(smoother.variables)
-        submaps.insert_keyframes(smoother.variables)
-    for _ in range(iterations):
-        if submaps is not None:
-            smoother.prior = submaps.graph(smoother.variables)
-        smoother.step(sigma_step)
-    keyframes = submaps.place(smoother.variables) if submaps is not None else {}
-    smoother.marginalize_keyframes()
-    return keyframes
-
-
-def solve_revisit(
-    smoother: Smoother, measured: RelativeFactor, iterations: int, sigma_step: float | None
-) -> dict[int, Array]:
-    """Optimize an open map with the window's oldest pose measured in the frame of a keyframe.
-
-    The measurement is one of the submaps from now on. Return the poses (3,) of the keyframes by cycle.
-    """
-    submaps = smoother.submaps
-    assert submaps is not None
-    submaps.finish(smoother.variables)
-    submaps.finished.append(measured)
-    keyframes = solve_loop(smoother, iterations, sigma_step)
-    smoother.submaps = submaps
-    return keyframes
-
-
 # --- other map points ------------------------------------------------------------------------------------
 
 
 def merge_points(smoother: Smoother, removed: IntArray, kept: IntArray) -> None:
     """Merge map points `removed` (k,) into points `kept` (k,), which keep their values.
 
-    Submaps do not follow, so the loop must be closed. The map's rows must be on the kept keys afterwards.
+    The map's rows must be on the kept keys afterwards.
     """
     variables, user = smoother.variables, smoother.user_factors.remove(removed, smoother.variables)
     reference, layout = variables.reference, variables.layout
@@ -116,7 +76,6 @@ def forget_poses(smoother: Smoother, first_cycle: int) -> None:
     The later poses keep their odometry, and one of them must be given a prior by `add_pose_prior`.
     """
     smoother.reactivate()
-    smoother.submaps = None
     leaving = pose_keys(np.arange(smoother.first_cycle, first_cycle))
     user = smoother.user_factors.remove(leaving, smoother.variables)
     smoother.prior = marginalize(graph_of(smoother.prior, *user), pose_keys(smoother.cycles))
@@ -128,7 +87,7 @@ def restart(smoother: Smoother, first_cycle: int, removed: IntArray, added: IntA
 
     Poses before `first_cycle` leave the window. A new prior must be set, on all that remains.
     """
-    smoother.submaps, smoother.inactive = None, InactiveMap()
+    smoother.inactive = InactiveMap()
     smoother.held, smoother.prior = None, gtsam.GaussianFactorGraph()
     smoother.variables.remove(np.append(smoother.variables.keyframes, removed))
     _drop_before(smoother, first_cycle)
@@ -151,3 +110,9 @@ def set_prior(smoother: Smoother, keys: IntArray, mean: Array, information: Arra
     root = np.asarray(np.linalg.cholesky(information).T, np.float64)
     prior = absolute_factor(keys, root, smoother.variables, mean)
     smoother.prior = graph_of(gtsam.HessianFactor(graph_of(prior)))
+
+
+def exchange_calibration_priors(smoother: Smoother, included: tuple[Array, Array]) -> None:
+    """Exchange the calibrations' priors that a new prior includes for those that the smoother has now."""
+    present, smoother.calibration_prior = smoother.calibration_prior, included
+    smoother.set_calibration_priors(*present)

@@ -1,4 +1,4 @@
-"""Relative factors: Gaussian information on coordinates in the frame of a pose, and submaps made of them.
+"""Relative factors: Gaussian information on coordinates in the frame of a pose, and revisits.
 
 All measurements of a drive are relative: detections relate poses to map points, and odometry relates poses to
 poses. So what an elimination leaves of them is a function of coordinates in the frame of any one of these
@@ -8,31 +8,24 @@ is linear in map coordinates does neither: it is linearized at the heading that 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import islice
-from typing import Self
 
 import gtsam
 import numpy as np
 
-from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors import se2
-from pathspace_graph.factors.arrays import Array, IntArray, read_only
-from pathspace_graph.factors.se2 import compose, left_of, relative, to_vehicle, wrap_angle
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import left_of, to_vehicle, wrap_angle
 
 from .gaussian import (
-    graph_of,
-    jacobian_factor,
     keys_of,
-    marginalize,
     normal_equations,
-    remove_information,
     square_root_form,
 )
 from .rows import Rows
-from .variables import ORIGIN_KEY, POSE, Layout, Variables, pose_key, pose_keys, rotation_blocks
+from .variables import ORIGIN_KEY, POSE, Layout, Variables, pose_keys, rotation_blocks
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,17 +53,6 @@ class RelativeFactor:
             block = np.asfortranarray(block[:, np.append(np.repeat(moves, widths), True)])
         matrix = gtsam.VerticalBlockMatrix([*widths[moves].tolist(), 1], block, False)
         return gtsam.GaussianConditional(keys[moves].tolist(), 1, matrix)
-
-    def without(self, keys: IntArray) -> RelativeFactor:
-        """Return the factor without information about some keys."""
-        removed = Layout(np.intersect1d(self.keys.keys, keys))
-        if removed.size == 0:
-            return self
-        kept = Layout(np.setdiff1d(self.keys.keys, removed.keys))
-        graph = graph_of(jacobian_factor(self.keys.keys, self.root, self.right))
-        graph = remove_information(graph, removed, np.zeros(removed.size))
-        root, right = square_root_form(*normal_equations(graph, kept))
-        return RelativeFactor(self.frame, kept, root, right, self.local[self.keys.entries(kept.keys)])
 
 
 def relative_factor(
@@ -133,88 +115,6 @@ def by_frame_of(values: Array, frame: Array, keys: Layout) -> Array:
     return matrix
 
 
-class Submaps:
-    """Submaps of the drive up to loop closure; the last of them is unfinished."""
-
-    def __init__(self, first: gtsam.GaussianFactorGraph, interval: float) -> None:
-        self.first = first  # absolute prior of the calibration and the first pose
-        self.interval = interval
-        self.finished: list[RelativeFactor] = []  # submaps, in the order of the drive
-        self.keyframes: dict[int, tuple[Array, Array]] = {}
-        """Pose (3,), when it was marginalized, and reference (3,) of each keyframe by key."""
-        self._attached: dict[int, tuple[int, Array]] = {}
-        """Anchor of a keyframe, and its pose (3,) in that frame; the newest keyframes have none yet."""
-        self._graph: gtsam.GaussianFactorGraph | None = None
-        self._keyframe = 0
-        self._driven = 0.0
-
-    def copy(self) -> Self:
-        """Return submaps that can go on independently."""
-        other = shallow(self)
-        other.finished = self.finished.copy()
-        other.keyframes = self.keyframes.copy()
-        other._attached = self._attached.copy()
-        return other
-
-    def add_pose(self, pose: int, factors: gtsam.GaussianFactorGraph, variables: Variables) -> None:
-        """Add the window's oldest pose, by its key, and its factors, without the prior, to the submap.
-
-        The pose is marginalized out unless it is the keyframe.
-        """
-        if self._driven >= self.interval:
-            self.finish(variables)
-        entries = variables.layout.entries(np.array([pose]))
-        if self._graph is None:
-            self._keyframe, self._graph, self._driven = pose, factors, 0.0
-            at = read_only(variables.linearized[entries]), read_only(variables.reference[entries])
-            self.keyframes[pose] = at
-        else:
-            self._graph = marginalize(graph_of(self._graph, factors), np.array([pose]))
-        following = variables.linearized[variables.layout.entries(np.array([pose + 1]))]
-        self._driven += float(np.hypot(*(following[:2] - variables.linearized[entries[:2]])))
-
-    def finish(self, variables: Variables) -> None:
-        """Finish the current submap at the oldest pose of the window."""
-        if self._graph is not None:
-            pose, reference = self.keyframes[self._keyframe]
-            self.finished.append(relative_factor(self._graph, self._keyframe, pose, reference, variables))
-            self._graph = None
-
-    def attach(self, anchor: int, pose: Array) -> None:
-        """Attach all new keyframes to an anchor, by its key, which is at a pose (3,); they move with it."""
-        for key, (keyframe, _) in islice(self.keyframes.items(), len(self._attached), None):
-            self._attached[key] = anchor, read_only(relative(pose, keyframe))
-
-    def place_attached(self, anchors: Mapping[int, Array]) -> None:
-        """Place all attached keyframes anew, given the poses (3,) of their anchors."""
-        for key, (anchor, local) in self._attached.items():
-            self.keyframes[key] = read_only(compose(anchors[anchor], local)), self.keyframes[key][1]
-        self._attached = {}
-
-    def remove_information(self, keys: IntArray, variables: Variables) -> None:
-        self.finish(variables)
-        self.finished = [submap.without(keys) for submap in self.finished]
-
-    def graph(self, variables: Variables) -> gtsam.GaussianFactorGraph:
-        """Return the prior as a graph on keyframes: all submaps, linearized at the variables' values."""
-        return graph_of(self.first, *(submap.factor(variables) for submap in self.finished))
-
-    def insert_keyframes(self, variables: Variables) -> None:
-        """Insert the keyframes as variables, as they were when they were marginalized or placed."""
-        keys = np.array(sorted(self.keyframes), np.intp)
-        known = np.array([self.keyframes[key] for key in keys.tolist()]).reshape(-1, 2, POSE)
-        variables.insert(keys, known[:, 0].ravel(), known[:, 1].ravel())
-
-    def place(self, variables: Variables) -> dict[int, Array]:
-        """Keep the keyframes where they have been solved to be, and return their poses (3,) by cycle."""
-        keys = np.array([*self.keyframes], np.intp)
-        poses = read_only(variables.of(keys).reshape(-1, POSE))
-        self.keyframes = {
-            key: (pose, self.keyframes[key][1]) for key, pose in zip(keys.tolist(), poses, strict=True)
-        }
-        return dict(zip((keys - pose_key(0)).tolist(), poses, strict=True))
-
-
 # --- a place that was met again --------------------------------------------------------------------------
 
 
@@ -230,10 +130,6 @@ class Revisit:
     later: int
     local: Array  # (3,) the measured pose y0 (m, m, rad)
     root: Array  # (3, 3) A, a square root of its information
-
-    def factor(self) -> RelativeFactor:
-        earlier, later = pose_keys(np.array([self.earlier, self.later]))
-        return RelativeFactor(int(earlier), Layout(np.array([later])), self.root, np.zeros(POSE), self.local)
 
 
 def revisit_rows(revisits: Sequence[Revisit], poses: Array) -> list[Rows]:

@@ -8,7 +8,8 @@ from typing import ClassVar, Final
 import numpy as np
 
 from pathspace_graph.batch.known_map import KnownMap
-from pathspace_graph.batch.lap import ClosedMap, LapMarginal
+from pathspace_graph.batch.lap import LapMarginal
+from pathspace_graph.batch.start import StartMap
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse
@@ -23,7 +24,6 @@ from .closing import lay_on_known, swap_in
 from .drive_record import DriveRecord
 from .known_loop import evidence_of
 from .lap_solver import LapSolver, Outcome
-from .revisit import lay_on
 
 REST: Final = 10.0  # distance after a failure on which phases do nothing (m)
 KNOWN: Final = "the map was known before the drive"  # reason why a drive on a known map has no batch
@@ -76,10 +76,14 @@ class Drive(Copyable):
 
     # --- batches -----------------------------------------------------------------------------------------
 
-    def begin_batch(self, road: Road, reading: Reading, start: ClosedMap | Revisit) -> None:
-        """Start a batch of the drive from a closed map, or from odometry and a relative pose."""
+    def begin_batch(
+        self, road: Road, reading: Reading, start: StartMap | None, revisits: tuple[Revisit, ...]
+    ) -> None:
+        """Start a batch of the drive with its revisits, from a map or from odometry."""
         window = road.smoother.first_cycle, road.next_cycle - 1
-        lap = partial(self.record.lap, start=start, settings=self.priors, noise=reading.noise)
+        lap = partial(
+            self.record.lap, start=start, revisits=revisits, settings=self.priors, noise=reading.noise
+        )
         self.solver.begin(lap, window, reading.detections.t)
 
     def outcome(self, road: Road, spent: float) -> Outcome | None:
@@ -87,14 +91,19 @@ class Drive(Copyable):
         smoother = road.smoother
         return self.solver.outcome(road.next_cycle - 1, smoother.times, smoother.first_cycle, spent)
 
-    def close(self, road: Road, solved: LapMarginal, returned_by: Revisit | None) -> Array:
+    def close(self, road: Road, solved: LapMarginal, returned_by: Revisit) -> Array:
         """Close the loop of an open road by the batch of a return; return the jump (3,)."""
         self.closed_by = returned_by
         return self.swap_in(road, solved)
 
+    def lay_on(self, road: Road, solved: LapMarginal, revisit: Revisit) -> Array:
+        """Replace an open map by the batch of a revisit; return the jump (3,)."""
+        self.revisits = (*self.revisits, revisit)
+        return self.swap_in(road, solved)
+
     def swap_in(self, road: Road, solved: LapMarginal) -> Array:
         """Replace map and prior of a road by those of a batch; return the jump (3,) of the newest pose."""
-        jump = swap_in(road.smoother, solved)
+        jump = swap_in(road, solved)
         self.lap_seconds = solved.seconds
         self.record.replaced(np.concatenate([solved.poses[: solved.first_kept], road.poses]))
         road.place_orange(self.record.corrected)
@@ -111,13 +120,6 @@ class Drive(Copyable):
         self.placed_at, self.keeps_map = road.smoother.times[-1], known.kept
         road.place_orange(self.record.corrected)
         self.monitor.restart()
-        return jump
-
-    def lay_on(self, road: Road, revisit: Revisit) -> Array:
-        """Optimize an open road with a revisit; return the jump (3,) of the newest pose."""
-        jump = lay_on(road, self.record, revisit)
-        self.revisits = (*self.revisits, revisit)
-        road.place_orange(self.record.corrected)
         return jump
 
 

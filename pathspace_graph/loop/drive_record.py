@@ -1,17 +1,16 @@
 """Record of the measurements and poses of a drive, from which a batch of the lap is built."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain as chain_of
 from typing import Final, Generic, TypeVar
 
 import numpy as np
 
-from pathspace_graph.batch.lap import ClosedMap, OpenLap
-from pathspace_graph.batch.start import unwrap
+from pathspace_graph.batch.lap import OpenLap
+from pathspace_graph.batch.start import StartMap, unwrap
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
-from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.front_end.noise import NoiseLearner
@@ -27,27 +26,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 T = TypeVar("T")
 C = TypeVar("C", bound=DetectionColumns)
-
-
-def bend(poses: Array, known: Mapping[int, Array]) -> Array:
-    """Bend a path of poses (n, 3) so that some of them have known values (3,), by index.
-
-    A pose between two known ones moves rigidly with each, and their results are interpolated by path length.
-    A pose after the last known one moves rigidly with it.
-    """
-    at, along = np.array(sorted(known)), path_lengths(poses)
-    before = at.searchsorted(np.arange(len(poses)), side="right") - 1
-    after, values = np.minimum(before + 1, len(at) - 1), np.array([known[k] for k in at.tolist()])
-    moved = []
-    for nearest in (before, after):
-        frames, to = poses[at[nearest]], values[nearest]
-        points = to_map(to_vehicle(poses[:, :2], frames), to)
-        moved.append(np.column_stack([points, poses[:, 2] + to[:, 2] - frames[:, 2]]))
-    driven, way = along - along[at[before]], along[at[after]] - along[at[before]]
-    weight = np.divide(driven, way, out=np.zeros_like(along), where=way > 0.0)[:, None]
-    change = moved[1] - moved[0]
-    change[:, 2] = wrap_angle(change[:, 2])
-    return np.asarray(moved[0] + weight * change)
 
 
 class CycleList(Copyable, Generic[T]):
@@ -130,13 +108,6 @@ class DriveRecord(Copyable):
         """Replace the poses (P, 3) of all cycles."""
         self.poses = self.corrected = read_only(unwrap(poses))
 
-    def bent(self, keyframes: Mapping[int, Array], road: Road) -> None:
-        """Replace the poses: those before the window move with the keyframes (3,), given by cycle."""
-        first = road.smoother.first_cycle
-        earlier, window = unwrap(self.poses[: first + 1]), road.poses
-        bent = bend(earlier, {0: earlier[0], **keyframes, first: window[0]})
-        self.replaced(np.concatenate([bent[:first], window]))
-
     def seen_in(self, sensor: Array, noise: NoiseLearner) -> SeenIn:
         """Return a lookup of the detections of given cycles, of orange cones too.
 
@@ -154,14 +125,19 @@ class DriveRecord(Copyable):
         return seen_in
 
     def lap(
-        self, first_kept: int, start: ClosedMap | Revisit, settings: MapperSettings, noise: NoiseLearner
+        self,
+        first_kept: int,
+        start: StartMap | None,
+        revisits: tuple[Revisit, ...],
+        settings: MapperSettings,
+        noise: NoiseLearner,
     ) -> OpenLap:
-        """Return the lap for a batch, with the priors of the calibrations in `settings`."""
+        """Return the drive for a batch, with the priors of the calibrations in `settings`."""
         cycles = [*self._measured]
         motions = noise.motions_of_lap([one.motion for one in cycles])
         chain = chained([*self.stamps], motions, settings.odometry)
         table = DetectionTable.of([one.seen for one in cycles], twists=chain.twists)
-        return OpenLap(settings, chain, _for_map(table, noise), first_kept, start, self._factors)
+        return OpenLap(settings, chain, _for_map(table, noise), first_kept, start, revisits, self._factors)
 
 
 def _for_map(table: C, noise: NoiseLearner) -> C:

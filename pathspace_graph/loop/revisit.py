@@ -2,8 +2,7 @@
 
 A lap closes where it began, but the second round of a skidpad does not, nor does a lane that leads into a
 circuit. There the cones of the last metres are registered to those of the earlier pass
-(`places.passes`), which gives a factor between two poses (`graph.relative:Revisit`). The open map is
-optimized with it as with a closed loop, and continues to grow.
+(`places.passes`), which gives the relative pose of two cycles (`graph.relative:Revisit`).
 """
 
 from typing import Final
@@ -13,18 +12,15 @@ import numpy as np
 from pathspace_graph.batch.start import REVISIT_INTERVAL
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose, inverse, path_lengths, to_vehicle
+from pathspace_graph.factors.se2 import path_lengths, to_vehicle
 from pathspace_graph.front_end.noise import NoiseLearner
-from pathspace_graph.graph.changes import solve_revisit
 from pathspace_graph.graph.relative import Revisit
 from pathspace_graph.mapping.path import HEADING
 from pathspace_graph.mapping.road import Road
-from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.places.constellation import Prior
-from pathspace_graph.places.passes import NEARBY, SeenIn, newest_place, revisit_of
+from pathspace_graph.places.passes import NEARBY, newest_place, revisit_of
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .closing import SIGMA_STEP
 from .drive_record import DriveRecord
 
 REVISIT_ATTEMPTS: Final = 3.0  # distance between attempts (m along the path)
@@ -43,40 +39,24 @@ class Revisits(Copyable):
         self._next = RETURN  # path length of the next attempt (m)
 
     def find(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
-        """Return a revisit by the oldest pose of the window, if an attempt is due and finds one."""
-        smoother, length = road.smoother, road.path.length
-        if length < self._next or record.unsolvable is not None or self.settings.of_lines:
-            return None
-        if smoother.submaps is None or not smoother.submaps.keyframes:
+        """Return the window's oldest pose relative to one of an earlier pass, if an attempt finds it.
+
+        The newest pose will stay in the window, and the batch's marginal has no measurement of such a pose.
+        """
+        length = road.path.length
+        if length < self._next or self.settings.of_lines:
             return None
         self._next = length + REVISIT_ATTEMPTS
         poses = record.with_window(road)
-        place = earlier_pass(poses)
-        seen_in = record.seen_in(smoother.variables.sensor, noise)
-        revisit = None if place is None else self._measured(smoother, seen_in, poses, place)
-        if revisit is not None:
-            self._next = length + REVISIT_INTERVAL
-        return revisit
-
-    def _measured(self, smoother: CurveSmoother, seen_in: SeenIn, poses: Array, place: int) -> Revisit | None:
-        """Return the oldest pose of the window relative to the keyframe nearest to an earlier place."""
+        place, later = earlier_pass(poses), road.smoother.first_cycle
+        if place is None or place >= later:
+            return None
+        seen_in = record.seen_in(road.smoother.variables.sensor, noise)
         found = newest_place(seen_in, poses, place, Prior.about(poses[-1], *NEARBY), self.settings)
         if found is None:
             return None
-        keyframes = np.array(smoother.keyframe_cycles)
-        earlier = int(keyframes[np.abs(keyframes - place).argmin()])
-        return revisit_of(found, poses, earlier, smoother.first_cycle)
-
-
-def lay_on(road: Road, record: DriveRecord, revisit: Revisit) -> Array:
-    """Optimize an open map with a revisit; return the jump (3,) of the newest pose."""
-    before = road.poses[-1].copy()
-    iterations = road.settings.closing.iterations
-    keyframes = solve_revisit(road.smoother, revisit.factor(), iterations, SIGMA_STEP)
-    after = road.poses[-1].copy()
-    road.move(compose(after, inverse(before)))
-    record.bent(keyframes, road)
-    return np.asarray(after - before)
+        self._next = length + REVISIT_INTERVAL
+        return revisit_of(found, poses, place, later)
 
 
 def earlier_pass(poses: Array) -> int | None:

@@ -60,7 +60,7 @@ class DetectionColumns:
         )
 
     @classmethod
-    def of_drives(cls, tables: Sequence[Self], drives: Drives) -> Self:
+    def of_drives(cls, tables: Sequence["DetectionColumns"], drives: Drives) -> Self:
         """Build the table of several drives with consecutive cycles, with no detection in use."""
         names = ("cycle", "measured", "twist", "covariance", "label")
         cycle, *columns = (np.concatenate([vars(table)[name] for table in tables]) for name in names)
