@@ -229,9 +229,8 @@ ASSIGNED = {
     "batch.association": {"state.pose_u"},
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"state.pose_u"},
-    "graph.changes": {f"smoother.{part}" for part in ("prior", "inactive", "held", "calibration_prior")}
-    | {"smoother.variables.first_cycle"},
-    "graph.smoother": {"self.variables.first_cycle"},
+    "graph.smoother": {f"smoother.{part}" for part in ("prior", "inactive", "held", "calibration_prior")}
+    | {"smoother.variables.first_cycle", "self.variables.first_cycle"},
     "baselines.landmark_association": {"detections.landmark"},
     "baselines.landmark_batch": {"state.votes", "detections.landmark"},
     "baselines.landmark_fixed_lag": {"self.smoother.window.exact", "state.votes", "state.next_number"},

@@ -24,8 +24,7 @@ from pathspace_graph.settings.mapper import MapperSettings, known_settings
 from . import landmark_association as association
 from .landmark_association import MATCH_GATE, find_duplicates
 from .landmark_fixed_lag import LandmarkFixedLag
-from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, point_map
-from .landmark_system import LandmarkSystem
+from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, LandmarkSystem, point_map
 
 LANDMARK_BATCH: Final = "landmark-batch"  # name of the estimator on the command line
 MAX_ROUNDS: Final = 10  # largest number of rounds of association

@@ -12,14 +12,12 @@ from pathspace_graph.batch.association import insert_drive
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import chi2_quantile
 from pathspace_graph.front_end.front_end import Reading
-from pathspace_graph.graph.changes import restart, set_prior
-from pathspace_graph.graph.drives import ONE_DRIVE
-from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.variables import NO_KEYS, POINT
+from pathspace_graph.graph.smoother import FixedLagSmoother, restart, set_prior
+from pathspace_graph.graph.variables import NO_KEYS, ONE_DRIVE, POINT
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.loop.drive_record import DriveRecord
+from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.mapping import motion as motions
 from pathspace_graph.mapping.motion import predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
@@ -35,10 +33,10 @@ from .landmark_map import (
     LandmarkMap,
     LandmarkSmoother,
     LandmarkState,
+    LandmarkSystem,
     landmark_counts,
     point_map,
 )
-from .landmark_system import LandmarkSystem
 from .online import FRONT_END, OnlineBaseline
 
 UNSEEN_PATH: Final = 40.0  # path without a detection after which a landmark is old (m)

@@ -17,7 +17,7 @@ from pathspace_graph.factors.se2 import path_lengths, relative, rotated, to_map,
 from pathspace_graph.front_end.front_end import JudgedLog
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import Elimination, linear_graph
-from pathspace_graph.graph.relative import Revisit, revisit_rows
+from pathspace_graph.graph.rows import Revisit, revisit_rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult, VehicleState

@@ -10,7 +10,7 @@ from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, left_of, move_points, relative
-from pathspace_graph.graph.changes import exchange_calibration_priors, hold_motion, restart, set_prior
+from pathspace_graph.graph.smoother import exchange_calibration_priors, hold_motion, restart, set_prior
 from pathspace_graph.graph.variables import NO_KEYS, control_keys, pose_keys
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother

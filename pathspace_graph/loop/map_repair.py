@@ -18,7 +18,7 @@ from pathspace_graph.batch.start import StartMap
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
-from pathspace_graph.graph.changes import place_again
+from pathspace_graph.graph.smoother import place_again
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import along_and_across

@@ -11,8 +11,7 @@ from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.factors.sensor import corrected
-from pathspace_graph.graph.drives import ONE_DRIVE, Drives, of_sensor
-from pathspace_graph.graph.variables import Variables
+from pathspace_graph.graph.variables import ONE_DRIVE, Drives, Variables, of_sensor
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
 

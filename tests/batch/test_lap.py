@@ -25,8 +25,7 @@ from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.graph.elimination import eliminated_system, linear_graph
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor
-from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.rows import Revisit, Rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, Layout, are_poses, indices, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, SplineBoundary

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.gaussian import graph_of, normal_equations
-from pathspace_graph.graph.relative import RelativeFactor
+from pathspace_graph.graph.inactive import RelativeFactor
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
     POSE,

@@ -8,7 +8,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, relative, wrap_angle
-from pathspace_graph.graph.relative import Revisit, revisit_rows
+from pathspace_graph.graph.rows import Revisit, revisit_rows
 from pathspace_graph.graph.variables import pose_keys
 
 from ..scenes.jacobians import numeric_jacobian

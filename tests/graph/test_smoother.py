@@ -9,10 +9,9 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose
-from pathspace_graph.graph.changes import merge_points
 from pathspace_graph.graph.gaussian import factorize, keys_of, normal_equations
 from pathspace_graph.graph.rows import Rows, calibrated_delta
-from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.smoother import FixedLagSmoother, merge_points
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, control_keys, pose_key, pose_keys
 from pathspace_graph.graph.window import SmootherSettings
 from pathspace_graph.online.fixed_lag import FixedLagMapper

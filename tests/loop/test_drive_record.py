@@ -12,11 +12,11 @@ from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_twists
 from pathspace_graph.factors.se2 import wrap_angle
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.front_end.noise import NoiseLearner
-from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.drive_record import DriveRecord
+from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry, known_noise
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.settings.mapper import MapperSettings

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.loop import returns
-from pathspace_graph.loop.returns import RETURN_CYCLES, ReturnFinder
+from pathspace_graph.loop.open import RETURN_CYCLES, ReturnFinder
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 

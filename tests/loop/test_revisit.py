@@ -14,14 +14,13 @@ from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import relative, to_vehicle
 from pathspace_graph.graph.gaussian import keys_of, normal_equations
-from pathspace_graph.graph.relative import revisit_rows
+from pathspace_graph.graph.rows import revisit_rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop import drive as drive_module
 from pathspace_graph.loop.drive import Drive, Step
 from pathspace_graph.loop.lap_solver import Outcome
-from pathspace_graph.loop.open import NOT_REVISITED, Open
-from pathspace_graph.loop.revisit import Revisits, earlier_pass
+from pathspace_graph.loop.open import NOT_REVISITED, Open, Revisits, earlier_pass
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.run import CycleResult

@@ -25,7 +25,7 @@ from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import drive as drives
 from pathspace_graph.loop import worker
 from pathspace_graph.loop.closing import _move_poses
-from pathspace_graph.loop.drive_record import DriveRecord
+from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.loop.open import STAYS_OPEN
 from pathspace_graph.mapping.road import HELD, Road
 from pathspace_graph.mapping.smoother import CurveSmoother
