@@ -12,7 +12,15 @@ from scipy.spatial import KDTree
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise, huber_weights
-from pathspace_graph.factors.se2 import compose, inverse, left_of, move_points, rotated, wrap_angle
+from pathspace_graph.factors.se2 import (
+    compose,
+    difference,
+    inverse,
+    left_of,
+    move_points,
+    rotated,
+    wrap_angle,
+)
 from pathspace_graph.front_end.sightings import ConeTracker, SeenCycle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary
@@ -234,9 +242,7 @@ def standing(cycles: Sequence[SeenCycle]) -> list[SeenCycle]:
 
 def _drifted(pose: Array, reckoned: Array) -> float:
     """Squared distance of a pose (3,) from dead reckoning, in its standard deviations."""
-    off = pose - reckoned
-    off[2] = wrap_angle(off[2])
-    return float(np.square(off / DRIFTED).sum())
+    return float(np.square(difference(pose, reckoned) / DRIFTED).sum())
 
 
 def _cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""The paper's state, pose and control points of clamped splines, its growth (paper: Expansion), and its update."""
+"""The paper's state: pose and control points of clamped splines, growth and update (paper: Expansion)."""
 
 from dataclasses import dataclass
 from typing import Final
