@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pathspace_graph.console import note, progress, say
+from pathspace_graph.console import progress, say
 from pathspace_graph.convert.bag import read_bag
 from pathspace_graph.convert.recording import Recording, rate, to_log, windowed
 from pathspace_graph.convert.settings import LabelRule
@@ -38,11 +38,6 @@ OF_KIND: Final = {  # kinds of records that take an option; any other option is 
     **dict.fromkeys(("odometry", "detections"), ("bag", "csv")),
     **dict.fromkeys(("imu", "wheelbase", "definition", "received", "namespaces", "label_field"), ("bag",)),
     **dict.fromkeys(("columns", "units"), ("csv",)),
-}
-UNITS_OPTION: Final = {  # option of `convert` that mends a cause of a hint about CSV files
-    **{"stamps": "--units time=ms", "positions": "--units length=mm"},
-    **{"speeds": "--units speed=km/h", "yaw rate": "--units yaw_rate=deg/s"},
-    "unexplained": "--units angle=deg",
 }
 
 
@@ -97,11 +92,7 @@ def _convert(options: Convert, source: Path, out: Path) -> None:
         log = with_measured_noise(replace(recorded, scale=options.scale), record.parts)
         write_checked(log, out, source, force=options.force)
     report(record.notes, rule, log)
-    found, mends = hints(log), UNITS_OPTION if options.kind == "csv" else {}
-    for number, hint in enumerate(found):
-        if hint.cause in mends:
-            found[number] = replace(hint, advice=f"{hint.advice} ({mends[hint.cause]})")
-    tell(found)
+    tell(hints(log))
 
 
 def _read(options: Convert, source: Path, rule: LabelRule) -> Recording:
@@ -169,8 +160,6 @@ def report(notes: Counter[str], rule: LabelRule, log: Log) -> None:
     say(*(f"{count} {text}" for text, count in notes.items() if count))
     measured = [] if log.measured is None else [measured_line(scaled(log.measured, 1.0 / log.scale))]
     labels = [rule.summary()] if rule.met else []
-    if hint := rule.hint():
-        note(f"hint: {hint}")
     say(*labels, outline(log), *measured, describe(log))
 
 

@@ -7,7 +7,6 @@ from numbers import Real
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
@@ -182,42 +181,28 @@ def scan_points(scan: Any) -> Points:
 
 def cloud_points(cloud: Any, rule: LabelRule) -> Points:
     """Points of a `PointCloud2` by its fields `x`, `y`, the label and, if any, xx, xy, yy."""
-    columns, covariances = _cloud_columns(cloud), None
-    points = np.column_stack([columns["x"], columns["y"]])
-    if {"xx", "xy", "yy"} <= columns.keys():
-        covariances = covariances_of(*(columns[entry].astype(float) for entry in ("xx", "xy", "yy")))
-    labels = np.full(len(points), UNKNOWN)
-    if rule.fields != (NO_LABEL,):
-        name = next((name for name in rule.fields if name in columns), None)
-        if name is None:
-            wanted = f"one of {', '.join(rule.fields)}" if len(rule.fields) > 1 else f"'{rule.fields[0]}'"
-            found = f"found {', '.join(columns)} (--label-field names it, `{NO_LABEL}` does without)"
-            raise MessageError(f"expected a point cloud with labels in the field {wanted}, {found}")
-        labels = rule.of_all(columns[name])
-    return Points.of(points, labels, covariances)
-
-
-def _cloud_columns(cloud: Any) -> dict[str, NDArray[Any]]:
-    order = ">" if cloud.is_bigendian else "<"
     known = {field.name: field for field in cloud.fields if field.datatype in CLOUD_TYPES}
     if not {"x", "y"} <= known.keys():
         raise MessageError(f"expected a point cloud with the fields x and y, found {', '.join(known)}")
-    if not cloud.width * cloud.height:
-        return {name: np.zeros(0) for name in known}
+    order = ">" if cloud.is_bigendian else "<"
     formats = [order + CLOUD_TYPES[field.datatype] for field in known.values()]
-    layout = {"names": [*known], "formats": formats, "itemsize": cloud.point_step}
-    layout["offsets"] = [field.offset for field in known.values()]
-    try:
-        of_a_point = np.dtype(layout)  # type: ignore[call-overload]
-    except ValueError as error:
-        expected = f"expected fields inside the {cloud.point_step} bytes of a point"
-        raise MessageError(f"{expected}: {error}") from None
-    rows, needed = np.frombuffer(bytes(cloud.data), np.uint8), cloud.height * cloud.row_step
-    if cloud.row_step < cloud.width * cloud.point_step or len(rows) < needed:
-        raise MessageError(f"expected a point cloud of {needed} bytes, found {len(rows)}")
-    rows = rows[:needed].reshape(cloud.height, cloud.row_step)[:, : cloud.width * cloud.point_step]
-    points = np.ascontiguousarray(rows).reshape(-1).view(of_a_point)
-    return {name: points[name] for name in known}
+    offsets = [field.offset for field in known.values()]
+    layout = {"names": [*known], "formats": formats, "offsets": offsets, "itemsize": cloud.point_step}
+    of_a_point = np.dtype(layout)  # type: ignore[call-overload]
+    rows = np.frombuffer(bytes(cloud.data), np.uint8)[: cloud.height * cloud.row_step]
+    rows = rows.reshape(cloud.height, cloud.row_step)[:, : cloud.width * cloud.point_step]
+    columns = np.ascontiguousarray(rows).reshape(-1).view(of_a_point)
+    labels, covariances = np.full(len(columns), UNKNOWN), None
+    if {"xx", "xy", "yy"} <= known.keys():
+        covariances = covariances_of(*(columns[entry].astype(float) for entry in ("xx", "xy", "yy")))
+    if rule.fields != (NO_LABEL,):
+        name = next((name for name in rule.fields if name in known), None)
+        if name is None:
+            wanted = f"one of {', '.join(rule.fields)}" if len(rule.fields) > 1 else f"'{rule.fields[0]}'"
+            found = f"found {', '.join(known)} (--label-field names it, `{NO_LABEL}` does without)"
+            raise MessageError(f"expected a point cloud with labels in the field {wanted}, {found}")
+        labels = rule.of_all(columns[name])
+    return Points.of(np.column_stack([columns["x"], columns["y"]]), labels, covariances)
 
 
 def array_points(message: Any, rule: LabelRule) -> Points:

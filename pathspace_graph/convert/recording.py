@@ -52,7 +52,6 @@ class Recording:
     imu: tuple[Array, Array] | None = None  # stamps (s) and yaw rates (rad/s) (k,) of an IMU
     rows: IntArray | None = None  # (N,) number of each row of the odometry in its file, by default from 1
     place: str = "odometry, row"  # what is counted by it
-    units: str = ""  # option that states the units of the odometry, where there is one
 
     @property
     def parts(self) -> int:
@@ -196,18 +195,11 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     lost = ~last[:-1] & (rows[1:, 2:] != rows[:-1, 2:]).any(axis=1)
     if 2 * lost.sum() > len(rows):
         found = f"found the stamp of another one in {lost.sum()} of {len(rows)}"
-        whole = ": are these whole seconds (--columns t=SECONDS+NANOSECONDS)?"
-        told = found + whole * bool((rows[:, 1] == np.floor(rows[:, 1])).all())
-        raise InputError(file, f"expected odometry samples with stamps of their own, {told}")
+        raise InputError(file, f"expected odometry samples with stamps of their own, {found}")
     rows = keep(last, "odometry samples had the stamp of another one, and were left out")
     if record.are_poses:
         if len(rows) < 2:
             raise InputError(file, f"expected two poses at least, found {len(rows)}")
-        often = float(np.quantile(np.abs(np.diff(rows[:, 4])) / np.diff(rows[:, 1]), 0.9))
-        if often > twists.LIMITS.yaw_rate:
-            found = f"found poses that turn by more than {often:.3g} rad/s in a tenth of the intervals"
-            unit = " (--units angle=deg)" * bool(record.units)
-            raise InputError(file, f"expected the yaw of poses in rad, {found}: is it in degrees{unit}?")
         rows = keep(
             twists.measured_anew(rows[:, 1], rows[:, 2:]),
             "odometry samples repeat the pose before them, and were left out",
@@ -246,8 +238,7 @@ def _possible(record: Recording, rows: Array, file: Path) -> BoolArray:
         most = twists.LIMITS
         limits = f"speeds of at most {most.speed:g} m/s and yaw rates of {most.yaw_rate:g} rad/s"
         where = f"at first {told(first, column)} in {record.at(numbers[first : first + 1])}"
-        unit = f" ({record.units})" if record.units else ""
-        found = f"found {wrong.sum()} of {len(t)} beyond, {where}: is the unit right{unit}?"
+        found = f"found {wrong.sum()} of {len(t)} beyond, {where}"
         raise InputError(file, f"expected {limits}, {found}")
     if jumped.sum() <= max(twists.MOST_WRONG * len(t), twists.FEW):  # else it is how this odometry is
         wrong = wrong | jumped

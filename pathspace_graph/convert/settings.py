@@ -25,8 +25,6 @@ DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers by default
 SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
 ORANGE_WORDS: Final = {"orange", "o"}
 BIG_WORDS: Final = {"big", "large"}
-# words of values that mean no side, and of colours, whose hue has decided
-UNKNOWN_WORDS: Final = {"unknown", "none", "other", "undefined", "uncolored", "colourless", "colour"}
 MOST_SHOWN: Final = 12  # number of label values in a line
 HUES: Final = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)}  # in degrees
 MIN_SATURATION: Final = 0.3  # least saturation of a colour that is not grey
@@ -196,18 +194,6 @@ class LabelRule:
         values = [f"{text or 'empty'} is {NAMES[label]} ({count})" for (text, label), count in most]
         return f"labels: {', '.join(values)}{', ...' * (len(self.met) > len(most))}" if values else ""
 
-    def hint(self) -> str:
-        """Hint at values that may mean a side; empty where there are none."""
-        unknown = [text for (text, label), _ in self.met.most_common() if label == UNKNOWN]
-        unmapped = [text for text in unknown if label_words(text).isdisjoint(UNKNOWN_WORDS) and text]
-        if not unmapped:
-            return ""
-        known = {label for _, label in self.met}
-        meant = "orange" if {LEFT, RIGHT} <= known else "right" if LEFT in known else "left"
-        told = f"labels {', '.join(unmapped[:MOST_SHOWN])} are read as unknown"
-        others = f"left, right, orange and big_orange are known labels, as in --labels {meant}={unmapped[0]}"
-        return f"{told}: {others}"
-
 
 def _whole(text: str) -> str:
     """Text of a whole number as `1`, also where it is written as `1.0`; else the text."""
@@ -218,14 +204,9 @@ def _whole(text: str) -> str:
     return str(int(number)) if isfinite(number) and number == int(number) else text
 
 
-def label_words(text: str) -> set[str]:
-    """Words of a text in lower case: those of `Blue-cone` are blue and cone."""
-    return set(re.findall(r"[a-z]+", text.lower()))
-
-
 def label_of_words(text: str) -> int:
-    """Label of a text by its words; UNKNOWN where none or several are of a side."""
-    words = label_words(text)
+    """Label of a text by its words, as blue and cone in `Blue-cone`; UNKNOWN where none or several tell."""
+    words = {*re.findall(r"[a-z]+", text.lower())}
     if words & ORANGE_WORDS:
         return BIG_ORANGE if words & BIG_WORDS else ORANGE
     sides = [label for label, names in SIDE_WORDS.items() if words & names]

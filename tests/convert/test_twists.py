@@ -153,7 +153,7 @@ def test_a_few_rows_beyond_any_vehicle_are_left_out_and_many_refused(
     convert(write(tmp_path, drive(), rows), code=code)
     said = capsys.readouterr()
     if code:
-        assert said.err.count("\n") == 1 and "is the unit right (--units" in said.err
+        assert said.err.count("\n") == 1 and "expected speeds of at most 100 m/s" in said.err
         assert (
             f"{len(wrong)} of {len(rows)} beyond, at first wz = 40 rad/s in odometry.csv, row 12" in said.err
         )
@@ -250,10 +250,10 @@ def test_a_trajectory_of_tum_is_read_as_poses(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "options", "said"),
     [
-        ("t,x,y,yaw", [], "is it in degrees (--units angle=deg)?"),
-        ("t,vx,vy,wz", ["--from-poses"], "--from-poses: expected the columns x, y and yaw"),
-        ("t,x,y,course", [], "expected a column 'vx' for vx, or a pose x, y, yaw"),
-        ("t,x,y,course", ["--from-poses"], "--from-poses: expected the columns x, y and yaw"),
+        ("t,x,y,yaw", [], "expected speeds of at most 100 m/s and yaw rates of 10 rad/s, found"),
+        ("t,vx,vy,wz", ["--from-poses"], "expected a column 'x' for --from-poses"),
+        ("t,x,y,course", [], "expected a column 'vx', or a pose x, y, yaw (--columns vx=NAME)"),
+        ("t,x,y,course", ["--from-poses"], "expected a column 'yaw' for --from-poses"),
         ("0.1,2,3,4", [], "odometry.csv, row 1: expected a header with the names of the columns"),
     ],
 )
