@@ -24,8 +24,7 @@ from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.options.data import Convert
 from pathspace_graph.plausibility.diagnosis import measured_line
-from pathspace_graph.plausibility.hint import because
-from pathspace_graph.plausibility.judge import hints
+from pathspace_graph.plausibility.judge import because, hints
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 

@@ -37,8 +37,7 @@ from pathspace_graph.lengths import scaled
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.options.map import Batch, MapKind, Online, Plot
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
-from pathspace_graph.plausibility.hint import Hint, objections
-from pathspace_graph.plausibility.judge import read_plausible_log
+from pathspace_graph.plausibility.judge import Hint, objections, read_plausible_log
 from pathspace_graph.run import Observer, OnlineEstimator, run_online, with_own
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import EVENTS

@@ -1,8 +1,14 @@
-"""Check of a log before it is mapped: hints about likely mistakes, also for a log that is refused."""
+"""Check of a log before it is mapped: hints about likely mistakes, also for a log that is refused.
 
+The texts of the hints are a table, `hints.csv`.
+"""
+
+import csv
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.resources import files
 from itertools import chain
 from math import hypot
 from pathlib import Path
@@ -10,32 +16,83 @@ from typing import Any, Final
 
 import numpy as np
 import scipy  # imports its modules lazily
+from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.front_end.gate import check_usable
+from pathspace_graph.factors.noise import ASSUMED_DRIFT, ray_sigmas
+from pathspace_graph.factors.se2 import move_points, relative
+from pathspace_graph.front_end.front_end import measure_log
+from pathspace_graph.front_end.gate import TWIST, check_usable
+from pathspace_graph.front_end.measurement import LEAST_NOISE
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
+from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_UNKNOWN, TwistRecord
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.covariances import covariances_of
-from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry
 from pathspace_graph.io.log_files import read_log
 from pathspace_graph.io.parsing import shown
 from pathspace_graph.io.tables import read_table
-from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
+from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.settings.online import LimitSettings
 
-from .diagnosis import noise_hints
-from .hint import Hint, because, hint_of
-from .kind import is_line
-from .regression import Better, Complex, Fit, Regression, far_better, motions_of
+from .regression import Better, Complex, Fit, Regression, dead_reckoned, far_better, motions_of
+
+SURVIVABLE: Final = {"gaps", "reach", "mounting", "covariances", "labels", "noise", "sides"}
+"""Causes in spite of which a map can be right."""
+
+
+@dataclass(frozen=True)
+class Hint:
+    """A likely mistake in a log; lengths in its texts are in metres of the log."""
+
+    cause: str
+    """Kind of the mistake."""
+    file: str
+    columns: str
+    """Columns of the file."""
+    found: str
+    """Finding, with its figure."""
+    likely: str
+    """Likely cause."""
+    advice: str
+    """Correction."""
+
+    @property
+    def line(self) -> str:
+        return f"{self.file}, {self.columns}: {self.found}; likely cause: {self.likely}; {self.advice}"
+
+
+with (files(__package__) / "hints.csv").open(encoding="utf-8") as _file:
+    TEXTS: Final = {row.pop("mistake"): row for row in csv.DictReader(_file)}
+    """Fields of the hint of each mistake, with places for its figures."""
+
+
+def hint_of(mistake: str, **figures: Any) -> Hint:
+    return Hint(**{name: text.format(**figures) for name, text in TEXTS[mistake].items()})
+
+
+def because(hints: Sequence[Hint]) -> str:
+    """Return the likely causes of a refusal in words; empty without hints."""
+    causes = [f"{hint.likely} ({hint.file}, {hint.columns}: {hint.found})" for hint in hints]
+    return f"likely cause: {'; '.join(causes)}" if causes else ""
+
+
+def objections(hints: Sequence[Hint]) -> list[str]:
+    """Return why the map of a log with these hints is wrong; empty if all are `SURVIVABLE`."""
+    likely = [hint.likely for hint in hints if hint.cause not in SURVIVABLE]
+    return [f"not a map of the drive: {'; '.join(likely)}"] if likely else []
+
+
+# --- the check -----------------------------------------------------------------------------------------
 
 LARGEST_READING: Final = 1e20  # largest number in a log for hints
 LEAST_TWISTS: Final = 20  # least number of twists for hints
 
 
 def hints(log: Log) -> list[Hint]:
-    """Return hints about likely mistakes in a log; those by motion are the strongest first.
+    """Hints about likely mistakes in a log; those by motion are the strongest first.
 
     There are none for weak evidence, nor for numbers that are not finite.
     """
@@ -111,7 +168,7 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
 
 
 def gaps_and_reach(log: Log) -> list[Hint]:
-    """Return hints if the vehicle drives without detections at an end, or if most cycles have hardly any."""
+    """Hints if the vehicle drives without detections at an end, or if most cycles have hardly any."""
     if not log.cycles:
         return []
     t, speed, begin, end = log.odometry.t, _speeds(log), log.cycles[0].t, log.cycles[-1].t
@@ -160,7 +217,7 @@ def beyond_any_vehicle(log: Log) -> list[Hint]:
 
 
 def camera(log: Log) -> list[Hint]:
-    """Return a hint if the detections lie on a line, as with the axes of a camera."""
+    """Hint if the detections lie on a line, as with the axes of a camera."""
     points = _points(log)
     spread = np.array([points.real.std(), points.imag.std()]) if len(points) else np.ones(2)
     least, most = spread.min(), spread.max()
@@ -236,7 +293,7 @@ FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation 
 
 
 def of_kind(log: Log) -> list[Hint]:
-    """Return a hint if detections are of the other kind than the log says, which is cones by default."""
+    """Hint if detections are of the other kind than the log says, which is cones by default."""
     stated = log.sensor.kind or "cones"
     found = {True: "line", False: "cones", None: stated}[is_line(log)]
     return [hint_of(f"kind {found}", stated=stated)] if found != stated else []
@@ -247,7 +304,7 @@ Told = dict[Hint, float]  # hints, and how much more of the motions each explain
 
 
 def motion_hints(log: Log) -> list[Hint]:
-    """Return hints by the regression, the strongest first."""
+    """Hints by the regression, the strongest first."""
     motions, told = motions_of(log), Told()
     share = 100.0 * len(motions.rate) / max(motions.tried, 1)
     few = motions.tried >= LEAST_PAIRS and share < UNEXPLAINED[0]
@@ -365,7 +422,7 @@ def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log) -> None:
 
 
 def side_hints(log: Log) -> list[Hint]:
-    """Return a hint if the motions that cones on the left and on the right show disagree in time."""
+    """Hint if the motions that cones on the left and on the right show disagree in time."""
     lags, (most, least) = [], SIDES
     for side in (LEFT, RIGHT):
         cycles = tuple(cycle.where(cycle.labels == side) for cycle in log.cycles)
@@ -379,6 +436,170 @@ def side_hints(log: Log) -> list[Hint]:
         return []
     late, early = ("left", "right") if apart > 0.0 else ("right", "left")
     return [hint_of("sides", late=late, early=early, ms=1e3 * abs(apart))]
+
+
+# --- noise that is stated ------------------------------------------------------------------------------
+
+NOISE_FACTOR: Final = 1.5  # least ratio of measured and stated noise of the odometry for a hint
+NOISE_AGREEMENT: Final = 1.2  # largest ratio between the orders of differences of white noise
+SCATTER_FACTOR: Final = 2.0  # least ratio of measured and stated noise of detections for a hint
+UNIT_FACTOR: Final = 10.0  # least ratio that tells another unit
+NOISE_SHARE: Final = 0.75  # least share of the detections with wrong covariances
+NOISE_CYCLES: Final = 300  # largest number of cycles on which the noise of detections is measured
+
+
+def noise_hints(log: Log, *, stay: bool = True) -> list[Hint]:
+    """Hints where the readings of a log contradict the stated noise by a large factor.
+
+    The noise of detections is measurable only if they `stay` in place, as cones do.
+    """
+    found = _odometry_hints(log) if log.odometry_stated else []
+    return found + (_detection_hints(log) if log.detections_stated and stay else [])
+
+
+def _odometry_hints(log: Log) -> list[Hint]:
+    """Compare white noise: orders of differences that disagree contain motion as well."""
+    twists = TwistRecord()
+    twists.add(log.odometry)
+    orders, white = twists.orders(), twists.white()
+    if orders is None or white is None:
+        return []
+    (least, interval), stated, hints = white, log.odometry_sigma, []
+    agree = orders.max(axis=0) < NOISE_AGREEMENT * least
+    most = np.hypot(least, np.array(ASSUMED_DRIFT) / np.sqrt(interval))
+    for which, values, size in (
+        (agree & (least > NOISE_FACTOR * stated), least, "small"),
+        (NOISE_FACTOR * most < stated, most, "large, unless it stands for errors that change slowly"),
+    ):
+        figures = [
+            f"{name} scatters by {value:.2g} {TWIST[name]}, and {said:.2g} is stated"
+            for name, value, said, chosen in zip(TWIST, values, stated, which, strict=True)
+            if chosen
+        ]
+        if figures:
+            hints.append(hint_of("noise of odometry", figures=", ".join(figures), size=size))
+    return hints
+
+
+def _detection_hints(log: Log) -> list[Hint]:
+    """Compare standard deviations along the ray or across it, whichever is farther off.
+
+    The size of a cone is the least noise; tracking with a gate limits the largest measurable noise.
+    """
+    cycles, found = log.cycles[:NOISE_CYCLES], dict[float, Hint]()
+    measured = measure_log(replace(log, cycles=cycles))
+    if measured is None or measured.along is None or measured.across is None:
+        return []
+    points = np.concatenate([cycle.points_vehicle for cycle in cycles])
+    stated = ray_sigmas(points, np.concatenate([cycle.covariances for cycle in cycles]))
+    near = (ranges := np.hypot(*points.T)) < FOLLOW_RANGE
+    ranges, stated, at = ranges[near], stated[near], float(np.median(ranges[near]))
+    gate = np.minimum(GATE_UNKNOWN[0] + GATE_UNKNOWN[1] * ranges, GATE_UNKNOWN[2])
+    floors = np.full(len(ranges), LEAST_NOISE[0]), LEAST_NOISE[1] * ranges
+    rays = ("along", measured.along), ("across", measured.across)
+    for (way, ray), claimed, floor in zip(rays, stated.T, floors, strict=True):
+        sigmas, scatter = ray.sigmas(ranges), float(ray.sigmas(np.array([at]))[0])
+        small = (sigmas > SCATTER_FACTOR * np.maximum(claimed, floor)).mean()
+        large = ((SCATTER_FACTOR * sigmas < claimed) & (3.0 * sigmas < gate)).mean()
+        if max(small, large) > NOISE_SHARE:
+            ratio = float(np.median(claimed / sigmas))
+            is_unit = not 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR
+            how = f"too {'small' if small > large else 'large'}"
+            how += ", as in another unit, or there are none at all" if is_unit else ""
+            figures = {
+                "scatter": scatter,
+                "at": at,
+                "stated": scatter * ratio,
+                "way": way,
+                "how": how,
+            }
+            cause = "covariances" if is_unit else "noise"
+            found[max(small, large)] = hint_of("noise of detections", cause=cause, **figures)
+    return [found[max(found)]] if found else []
+
+
+# --- cones, or points of lines -------------------------------------------------------------------------
+
+COMPARED: Final = 2  # nearest detections of a side that are compared: noise grows with the range
+PARTNERS: Final = 10  # nearest detections of an earlier cycle among which each of them has its partner
+MOVED: Final = 0.25  # least way between both cycles, over the gap: at rest a line is seen at the same places
+LONGEST: Final = 1.5  # longest time between them (s), over which odometry hardly drifts
+MOST_AWAY: Final = 1.5  # largest distance that counts, over half the gap
+PATIENCE: Final = 120.0  # time (s) that is looked at
+FEWEST: Final = 80  # comparisons that tell: the median of a line has a sigma of 0.08
+ENOUGH: Final = 300  # comparisons that are enough: 0.1 to 0.27 was met for cones, 0.46 to 1.2 for lines
+CONES: Final = 0.32  # median distance over half the gap up to which they are cones
+LINE: Final = 0.4  # from which on they are points of a line; between, it cannot be told
+ON_LINE: Final = 2.2  # median distance (sigmas) across the line up to which points are on it, not garbled
+LEAST_SIGMA: Final = 1e-3  # least standard deviation of that distance (m)
+SAME: Final = 3.0  # largest distance (sigmas) of two detections of one cone
+
+
+@lru_cache(maxsize=2)
+def is_line(log: Log) -> bool | None:
+    """Whether the detections of the first seconds of a log are points of lines; None if that is not clear.
+
+    The nearest detections of each side are laid on those of an earlier cycle by odometry. Cones find
+    themselves there, within their noise. Points of a line find a neighbour: at distances that are spread
+    evenly over half the gap between points, whatever the gap.
+    """
+    cycles = [cycle for cycle in log.cycles if cycle.t <= log.cycles[0].t + PATIENCE]
+    poses = dead_reckoned(log.odometry, np.array([cycle.t for cycle in cycles]))
+    away, across = list[float](), list[float]()  # from partners, over half the gap; from their line (sigmas)
+    for side, label in enumerate(BOUNDARIES):
+        seen = list[tuple[float, Array, Array, Array]]()
+        for cycle, pose in zip(cycles, poses, strict=True):
+            own = cycle.labels  # or the vehicle's side, where no detection has a label
+            if (own == UNKNOWN).all():
+                own = np.where(cycle.points_vehicle[:, 1] > 0.0, LEFT, RIGHT)
+            points, sigmas = _nearest_of_side(cycle.where(own == label))
+            if len(points) > 1:
+                seen.append((cycle.t, pose, points, sigmas))
+        if not seen:
+            continue
+        gaps = (KDTree(points).query(points[:COMPARED], k=2)[0] for _, _, points, _ in seen)
+        gap = float(np.median([np.median(apart[:, 1]) for apart in gaps]))
+        for k, (t, pose, points, sigmas) in enumerate(seen):
+            begin = int(np.searchsorted([one[0] for one in seen[:k]], t - LONGEST))
+            for _, earlier, partners, _ in reversed(seen[begin:k]):
+                way = relative(earlier, pose)
+                if np.hypot(way[0], way[1]) < MOVED * gap:
+                    continue
+                placed = move_points(way, points[:COMPARED])
+                found = np.hypot(*placed.T) < np.hypot(*partners[-1])
+                apart = KDTree(partners).query(placed[found])[0]
+                away += np.minimum(apart / (0.5 * gap), MOST_AWAY).tolist()
+                sigma = np.maximum(2.0**0.5 * sigmas[:COMPARED][found], LEAST_SIGMA)
+                across += (_from_line(placed[found], partners) / sigma).tolist()
+                break
+            if len(away) >= (side + 1) * ENOUGH // 2:
+                break
+    if len(away) < FEWEST:
+        return None
+    if np.median(away) < CONES:
+        return False
+    return True if np.median(away) > LINE and np.median(across) < ON_LINE else None
+
+
+def _nearest_of_side(detections: Detections) -> tuple[Array, Array]:
+    """Nearest points (k, 2), one per cone, and the standard deviation (k,) of a coordinate (m)."""
+    points, covariances = detections.points_vehicle, detections.covariances
+    variances, chosen = 0.5 * np.trace(covariances, axis1=1, axis2=2), list[int]()
+    for k in np.argsort(np.hypot(*points.T)).tolist():
+        apart = ((points[chosen] - points[k]) ** 2).sum(axis=1)
+        if (apart > SAME**2 * (variances[chosen] + variances[k])).all():
+            chosen.append(k)
+        if len(chosen) == PARTNERS:
+            break
+    return points[chosen], np.sqrt(variances[chosen])
+
+
+def _from_line(points: Array, corners: Array) -> Array:
+    """Distances (m,) of each point (m, 2) from the line through corners (k, 2), at least two."""
+    begin, step = corners[:-1], np.diff(corners, axis=0)
+    off = points[:, None] - begin
+    share = np.clip((off * step).sum(axis=2) / (step**2).sum(axis=1), 0.0, 1.0)
+    return np.asarray(np.hypot(*(off - share[..., None] * step).transpose(2, 0, 1)).min(axis=1))
 
 
 # --- logs that are refused, and words of labels ----------------------------------------------------------

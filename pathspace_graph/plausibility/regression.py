@@ -75,9 +75,8 @@ def motions_of(
 ) -> Motions:
     """Register nearby cycles to each other; the odometry gives only the first of several starts."""
     cycles = [_nearest(cycle) for cycle in log.cycles if len(cycle.labels) >= fewest]
-    stamps, odometry = np.array([cycle.t for cycle in cycles]), log.odometry
-    stated = np.vstack([np.zeros((1, 3)), integrate_poses(np.diff(odometry.t), odometry.twist[:-1])])
-    poses = np.column_stack([np.interp(stamps, odometry.t, column) for column in stated.T])
+    stamps = np.array([cycle.t for cycle in cycles])
+    poses = dead_reckoned(log.odometry, stamps)
     longest = max(LONGEST_PAIR, 1.5 * float(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0.0
     every, rows, tried = ceil(len(cycles) / most), list[Any](), 0
     for gap in GAPS:
@@ -95,6 +94,12 @@ def motions_of(
     table = np.array(sorted(rows, key=lambda row: row[0] + row[1])).reshape(-1, 14)
     begin, end, vx, vy, rate = table[:, :5].T
     return Motions(begin, end, vx + 1j * vy, rate, table[:, 5:].reshape(-1, 3, 3), tried)
+
+
+def dead_reckoned(odometry: Odometry, stamps: Array) -> Array:
+    """Poses (n, 3) at stamps (n,) in s, by the odometry alone."""
+    poses = np.vstack([np.zeros((1, 3)), integrate_poses(np.diff(odometry.t), odometry.twist[:-1])])
+    return np.column_stack([np.interp(stamps, odometry.t, column) for column in poses.T])
 
 
 def _nearest(cycle: Detections) -> Detections:

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from pathspace_graph import hints
 from pathspace_graph.factors.se2 import relative, se2_exp, to_vehicle
 from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.plausibility.hint import Hint, objections
-from pathspace_graph.plausibility.judge import SPEED_UNITS, unit_of
+from pathspace_graph.plausibility.judge import SPEED_UNITS, Hint, objections, unit_of
 from pathspace_graph.plausibility.regression import (
     LAGS,
     Fit,
