@@ -88,7 +88,6 @@ def objections(hints: Sequence[Hint]) -> list[str]:
 # --- the check -----------------------------------------------------------------------------------------
 
 LARGEST_READING: Final = 1e20  # largest number in a log for hints
-LEAST_TWISTS: Final = 20  # least number of twists for hints
 
 
 def hints(log: Log) -> list[Hint]:
@@ -99,7 +98,7 @@ def hints(log: Log) -> list[Hint]:
     check_type("log", log, Log)
     arrays = ((cycle.points_vehicle, cycle.covariances) for cycle in log.cycles)
     parts = (*_stamps(log).values(), log.odometry.twist, *chain.from_iterable(arrays))
-    if len(log.odometry.t) < LEAST_TWISTS or any(not (np.abs(one) <= LARGEST_READING).all() for one in parts):
+    if len(log.odometry.t) < 20 or any(not (np.abs(one) <= LARGEST_READING).all() for one in parts):
         return []
     if of_parts := parts_of_stamps(log):
         return of_parts
@@ -124,17 +123,8 @@ def hints(log: Log) -> list[Hint]:
 
 TIME_UNITS: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size (s)
 LENGTH_UNITS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # by size (m)
-USUAL_STEPS: Final = 2e-4, 5.0  # shortest and longest usual time between rows (s)
 WITHOUT_DETECTIONS: Final = 10.0  # longest drive before the first detection or after the last one (s)
-DRIVING: Final = 0.1  # least share of the largest speed while driving
-LEAST_CYCLES: Final = 100  # least number of cycles whose typical number of detections tells the sensor's
-USUAL_RANGES: Final = 0.05, 20.0, 120.0  # typical ranges of cones: least, of the likelier unit, most (m)
 FASTEST: Final = 100.0, 8.0  # speed (m/s) and yaw rate (rad/s) that no vehicle exceeds in a tenth of its time
-LARGEST_STEPS: Final = 10.0, 10.0, 5.0  # from the rows around to a row that can be (m/s, m/s, rad/s)
-USUAL: Final = 0.9  # and at most this quantile of the column
-MOST_STEPS: Final = 0.02  # largest share of rows that cannot be
-LINE_RATIO: Final = 0.1  # largest ratio of the spreads of two coordinates of detections on a line
-BOTH_SIDES: Final = 0.15  # largest deviation from 0.5 of the share of a label that is on both sides
 
 
 def parts_of_stamps(log: Log) -> list[Hint]:
@@ -155,9 +145,9 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
     """Return the log with stamps in seconds, and a hint for each file with another unit."""
     found, sizes = [], dict.fromkeys(_stamps(log), 1.0)
     for file, t in _stamps(log).items():
-        step, (shortest, longest) = _median(np.abs(np.diff(t))), USUAL_STEPS
-        fitting = [size for size in TIME_UNITS if shortest <= step * size <= longest]
-        if step > longest and fitting:
+        step = _median(np.abs(np.diff(t)))
+        fitting = [size for size in TIME_UNITS if 2e-4 <= step * size <= 5.0]
+        if step > 5.0 and fitting:  # rows are usually 0.2 ms to 5 s apart
             size = sizes[file] = fitting[0]
             found.append(hint_of("unit of stamps", file=file, step=step, unit=TIME_UNITS[size], size=size))
     if not found:
@@ -172,22 +162,22 @@ def gaps_and_reach(log: Log) -> list[Hint]:
     if not log.cycles:
         return []
     t, speed, begin, end = log.odometry.t, _speeds(log), log.cycles[0].t, log.cycles[-1].t
-    driven = t[speed > DRIVING * speed.max()]
+    driven = t[speed > 0.1 * speed.max()]  # else it stands
     early = driven.size and begin - driven[0] > WITHOUT_DETECTIONS
     late = driven.size and driven[-1] - end > WITHOUT_DETECTIONS
     found = [hint_of("detections begin late", seconds=begin - t[0])] if early else []
     found += [hint_of("detections end early", seconds=t[-1] - end)] if late else []
     typical = _median(np.array([len(cycle.labels) for cycle in log.cycles]))
-    few = len(log.cycles) >= LEAST_CYCLES and typical < MIN_MATCHED
+    few = len(log.cycles) >= 100 and typical < MIN_MATCHED
     return found + ([hint_of("few detections", count=typical, least=MIN_MATCHED)] if few else [])
 
 
 def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
-    typical, (least, likely, most) = _median(np.abs(_points(log))), USUAL_RANGES
-    if typical > most:
-        size = next((size for size in LENGTH_UNITS if typical * size <= likely), min(LENGTH_UNITS))
+    typical = _median(np.abs(_points(log)))
+    if typical > 120.0:  # cones are seen at 20 m or less
+        size = next((size for size in LENGTH_UNITS if typical * size <= 20.0), min(LENGTH_UNITS))
         what = f"are in {LENGTH_UNITS[size]}, not in metres"
-    elif 0.0 < typical < least:
+    elif 0.0 < typical < 0.05:
         size, what = 1e3, "were divided by 1000 although they were in metres"
     else:
         return log, []
@@ -201,8 +191,9 @@ def possible_rows(log: Log) -> tuple[Log, list[Hint]]:
     twist = log.odometry.twist
     smooth = scipy.ndimage.median_filter(twist, size=(5, 1), mode="nearest")
     step = np.abs(twist - smooth)
-    wrong = step > np.maximum(LARGEST_STEPS, np.quantile(np.abs(twist), USUAL, axis=0))
-    if not 0 < wrong.any(axis=1).sum() < MOST_STEPS * len(twist):
+    # a row steps by at most 10 m/s or 5 rad/s, or by the speeds of the drive itself
+    wrong = step > np.maximum((10.0, 10.0, 5.0), np.quantile(np.abs(twist), 0.9, axis=0))
+    if not 0 < wrong.any(axis=1).sum() < 0.02 * len(twist):  # more rows are how this odometry is
         return log, []
     row, count = int((step * wrong).max(axis=1).argmax()), int(wrong.any(axis=1).sum())
     figures = {"count": count, "total": len(twist), "step": step[row].max(), "row": row + 2}
@@ -221,13 +212,13 @@ def camera(log: Log) -> list[Hint]:
     points = _points(log)
     spread = np.array([points.real.std(), points.imag.std()]) if len(points) else np.ones(2)
     least, most = spread.min(), spread.max()
-    in_line = least < LINE_RATIO * most
+    in_line = least < 0.1 * most  # all detections on a line
     return [hint_of("camera", thin="xy"[int(spread.argmin())], least=least, most=most)] if in_line else []
 
 
 def one_label(log: Log) -> list[Hint]:
     share, labels = sided(log), set(np.unique(_labels(log)).tolist())
-    if labels not in ({LEFT}, {RIGHT}) or abs(share - 0.5) > BOTH_SIDES:
+    if labels not in ({LEFT}, {RIGHT}) or abs(share - 0.5) > 0.15:
         return []
     return [hint_of("one label", label=NAMES[labels.pop()], share=100.0 * share)]
 
@@ -267,20 +258,10 @@ RATE_UNITS: Final = {float(np.pi / 180.0): "degrees per second"}
 SAME_FACTOR: Final = 1.2  # largest ratio of a factor and a unit
 FACTOR_TOLD: Final = 1.6  # least factor, or its inverse, that is told if it is no unit
 TINY: Final = 1e-9  # least size of a factor
-LATE_TOLD: Final = 0.2  # least lag that is told (s): less is left to the calibration
 TURN_TOLD: Final = 8.5  # least yaw of the sensor that is told (degrees)
-TURN_SIGMA: Final = 1.0  # largest standard deviation of the yaw (degrees)
-LEVER_TOLD: Final = 1.0  # least lever arm of the sensor that is told (m)
-LEVER_SIGMA: Final = 0.2  # largest relative standard deviation of the lever arm
 FLAT: Final = 0.2  # largest size of a missing rate, by what the cones show
-AT_REST: Final = 0.03  # largest difference of explained shares between no motion and the best fit
-LEAST_MOTIONS: Final = 20  # least number of motions for a regression
-LEAST_PAIRS: Final = 30  # least number of pairs of cycles that can show no motion,
-UNEXPLAINED: Final = 30.0, 0.2  # with at most this share of them that do (%), explained to this degree
+UNEXPLAINED: Final = 30.0, 0.2  # largest share of pairs that show a motion (%), and its explained degree
 WELL_EXPLAINED: Final = 0.5  # least explained share for a small turn and a place, and for another drive
-FAR_LESS: Final = 0.4  # largest share that a fit explains of another drive, by what the cones show
-SIDES_TOLD: Final = 0.015  # least difference between the lags of both sides that is told (s),
-SIDES_CLEAR: Final = 4.0  # and in standard deviations
 SIDES: Final = 2000, 300  # approximate number of cycles of a side in use, and least number of motions
 FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation (degrees) and whether mirrored
     (180, False): ("the sensor's frame has x to the rear and y to the right", "-x", "-y"),
@@ -307,14 +288,15 @@ def motion_hints(log: Log) -> list[Hint]:
     """Hints by the regression, the strongest first."""
     motions, told = motions_of(log), Told()
     share = 100.0 * len(motions.rate) / max(motions.tried, 1)
-    few = motions.tried >= LEAST_PAIRS and share < UNEXPLAINED[0]
+    few = motions.tried >= 30 and share < UNEXPLAINED[0]
     unexplained = [hint_of("unexplained", share=share, tried=motions.tried)] if few else []
-    if len(motions.rate) < LEAST_MOTIONS:
+    if len(motions.rate) < 20:
         return beyond_any_vehicle(log) or unexplained
     regression = Regression(log.odometry, motions)
     fit, why = regression.best()
     explained, rest = regression.explained(fit), regression.shares(0.0 * motions.velocity, 0.0 * motions.rate)
-    may_rest = rest.both.mean() > explained.both.mean() - AT_REST
+    # no motion at all explains as much as the best fit
+    may_rest = rest.both.mean() > explained.both.mean() - 0.03
     stated = log.sensor.kind == "line"
     lines, of_log = (
         stated or bool(is_line(one)) for one in (replace(log, odometry=regression.odometry(fit)), log)
@@ -329,7 +311,7 @@ def motion_hints(log: Log) -> list[Hint]:
     if jump := far_better(jumping, np.maximum(explained.both, rest.both)):
         tell(told, jump, "clock jumps", seconds=after - before, when=when)
     else:
-        late = why.get("lag") if abs(fit.lag) > LATE_TOLD else None
+        late = why.get("lag") if abs(fit.lag) > 0.2 else None  # less (s) is left to the calibration
         tell(told, late, "late" if fit.lag > 0.0 else "early", seconds=abs(fit.lag))
         tell_missing(told, regression, fit)
     if not may_rest and all(hint.cause != "speeds" for hint in told):
@@ -359,7 +341,7 @@ def tell_missing(told: Told, regression: Regression, fit: Fit) -> None:
         tell(told, way, "no speed", **speeds)
     elif no_sign := far_better(backward.way, explained.way):
         tell(told, no_sign, "no sign")
-    elif seen.both.mean() > max(WELL_EXPLAINED, explained.both.mean() / FAR_LESS):
+    elif seen.both.mean() > max(WELL_EXPLAINED, explained.both.mean() / 0.4):
         tell(told, way or turn, "other drive", which="way" if way else "turns")
 
 
@@ -395,7 +377,8 @@ def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log) -> None:
     turn = float(np.angle(fit.gain, deg=True)) * (1.0 if mirror else -1.0)
     better = far_better(explained.way, regression.explained(replace(fit, gain=complex(size))).way)
     clear, sure = explained.both.mean() > WELL_EXPLAINED, Better(0.0, "")
-    small = sure if clear and np.rad2deg(fit.sigmas[0] / size) < TURN_SIGMA else None
+    # a small turn is told where it is known to a degree
+    small = sure if clear and np.rad2deg(fit.sigmas[0] / size) < 1.0 else None
     quarter = (90 * round(turn / 90.0) + 179) % 360 - 179
     is_quarter = abs((turn - quarter + 180.0) % 360.0 - 180.0) < TURN_TOLD
     vx, vy = np.median(log.odometry.twist[:, :2], axis=0)
@@ -415,7 +398,8 @@ def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log) -> None:
         back = np.exp(1j * np.deg2rad(turn))
         of_detections = sided(log, back, mirrored=True) >= sided(log, np.conj(back))
         tell(told, mirror, "y to the right" if of_detections else "yaw rate to the right")
-    if clear and abs(fit.lever) > max(LEVER_TOLD, fit.sigmas[1] / LEVER_SIGMA):
+    # a lever of a metre, known to a fifth
+    if clear and abs(fit.lever) > max(1.0, fit.sigmas[1] / 0.2):
         place = fit.lever * np.conj(fit.gain) / size
         ahead, left = place.real, -place.imag if mirror else place.imag
         tell(told, sure, "place", ahead=ahead, left=left, along=f"{ahead:+.2f}", aside=f"{left:+.2f}")
@@ -432,7 +416,7 @@ def side_hints(log: Log) -> list[Hint]:
         regression = Regression(log.odometry, motions)
         lags.append(regression.lag(regression.fit("twist", 0.0)))
     apart, sigma = lags[0][0] - lags[1][0], hypot(lags[0][1], lags[1][1])
-    if abs(apart) < max(SIDES_TOLD, SIDES_CLEAR * sigma):
+    if abs(apart) < max(0.015, 4.0 * sigma):
         return []
     late, early = ("left", "right") if apart > 0.0 else ("right", "left")
     return [hint_of("sides", late=late, early=early, ms=1e3 * abs(apart))]
@@ -441,11 +425,8 @@ def side_hints(log: Log) -> list[Hint]:
 # --- noise that is stated ------------------------------------------------------------------------------
 
 NOISE_FACTOR: Final = 1.5  # least ratio of measured and stated noise of the odometry for a hint
-NOISE_AGREEMENT: Final = 1.2  # largest ratio between the orders of differences of white noise
 SCATTER_FACTOR: Final = 2.0  # least ratio of measured and stated noise of detections for a hint
 UNIT_FACTOR: Final = 10.0  # least ratio that tells another unit
-NOISE_SHARE: Final = 0.75  # least share of the detections with wrong covariances
-NOISE_CYCLES: Final = 300  # largest number of cycles on which the noise of detections is measured
 
 
 def noise_hints(log: Log, *, stay: bool = True) -> list[Hint]:
@@ -465,7 +446,7 @@ def _odometry_hints(log: Log) -> list[Hint]:
     if orders is None or white is None:
         return []
     (least, interval), stated, hints = white, log.odometry_sigma, []
-    agree = orders.max(axis=0) < NOISE_AGREEMENT * least
+    agree = orders.max(axis=0) < 1.2 * least
     most = np.hypot(least, np.array(ASSUMED_DRIFT) / np.sqrt(interval))
     for which, values, size in (
         (agree & (least > NOISE_FACTOR * stated), least, "small"),
@@ -486,7 +467,7 @@ def _detection_hints(log: Log) -> list[Hint]:
 
     The size of a cone is the least noise; tracking with a gate limits the largest measurable noise.
     """
-    cycles, found = log.cycles[:NOISE_CYCLES], dict[float, Hint]()
+    cycles, found = log.cycles[:300], dict[float, Hint]()
     measured = measure_log(replace(log, cycles=cycles))
     if measured is None or measured.along is None or measured.across is None:
         return []
@@ -501,7 +482,7 @@ def _detection_hints(log: Log) -> list[Hint]:
         sigmas, scatter = ray.sigmas(ranges), float(ray.sigmas(np.array([at]))[0])
         small = (sigmas > SCATTER_FACTOR * np.maximum(claimed, floor)).mean()
         large = ((SCATTER_FACTOR * sigmas < claimed) & (3.0 * sigmas < gate)).mean()
-        if max(small, large) > NOISE_SHARE:
+        if max(small, large) > 0.75:
             ratio = float(np.median(claimed / sigmas))
             is_unit = not 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR
             how = f"too {'small' if small > large else 'large'}"
@@ -521,18 +502,11 @@ def _detection_hints(log: Log) -> list[Hint]:
 # --- cones, or points of lines -------------------------------------------------------------------------
 
 COMPARED: Final = 2  # nearest detections of a side that are compared: noise grows with the range
-PARTNERS: Final = 10  # nearest detections of an earlier cycle among which each of them has its partner
 MOVED: Final = 0.25  # least way between both cycles, over the gap: at rest a line is seen at the same places
 LONGEST: Final = 1.5  # longest time between them (s), over which odometry hardly drifts
-MOST_AWAY: Final = 1.5  # largest distance that counts, over half the gap
-PATIENCE: Final = 120.0  # time (s) that is looked at
 FEWEST: Final = 80  # comparisons that tell: the median of a line has a sigma of 0.08
-ENOUGH: Final = 300  # comparisons that are enough: 0.1 to 0.27 was met for cones, 0.46 to 1.2 for lines
 CONES: Final = 0.32  # median distance over half the gap up to which they are cones
 LINE: Final = 0.4  # from which on they are points of a line; between, it cannot be told
-ON_LINE: Final = 2.2  # median distance (sigmas) across the line up to which points are on it, not garbled
-LEAST_SIGMA: Final = 1e-3  # least standard deviation of that distance (m)
-SAME: Final = 3.0  # largest distance (sigmas) of two detections of one cone
 
 
 @lru_cache(maxsize=2)
@@ -543,7 +517,7 @@ def is_line(log: Log) -> bool | None:
     themselves there, within their noise. Points of a line find a neighbour: at distances that are spread
     evenly over half the gap between points, whatever the gap.
     """
-    cycles = [cycle for cycle in log.cycles if cycle.t <= log.cycles[0].t + PATIENCE]
+    cycles = [cycle for cycle in log.cycles if cycle.t <= log.cycles[0].t + 120.0]
     poses = dead_reckoned(log.odometry, np.array([cycle.t for cycle in cycles]))
     away, across = list[float](), list[float]()  # from partners, over half the gap; from their line (sigmas)
     for side, label in enumerate(BOUNDARIES):
@@ -568,17 +542,19 @@ def is_line(log: Log) -> bool | None:
                 placed = move_points(way, points[:COMPARED])
                 found = np.hypot(*placed.T) < np.hypot(*partners[-1])
                 apart = KDTree(partners).query(placed[found])[0]
-                away += np.minimum(apart / (0.5 * gap), MOST_AWAY).tolist()
-                sigma = np.maximum(2.0**0.5 * sigmas[:COMPARED][found], LEAST_SIGMA)
+                away += np.minimum(apart / (0.5 * gap), 1.5).tolist()
+                sigma = np.maximum(2.0**0.5 * sigmas[:COMPARED][found], 1e-3)
                 across += (_from_line(placed[found], partners) / sigma).tolist()
                 break
-            if len(away) >= (side + 1) * ENOUGH // 2:
+            # comparisons that are enough: 0.1 to 0.27 was met for cones, 0.46 to 1.2 for lines
+            if len(away) >= (side + 1) * 300 // 2:
                 break
     if len(away) < FEWEST:
         return None
     if np.median(away) < CONES:
         return False
-    return True if np.median(away) > LINE and np.median(across) < ON_LINE else None
+    # what is farther from the line than 2.2 sigmas is garbled
+    return True if np.median(away) > LINE and np.median(across) < 2.2 else None
 
 
 def _nearest_of_side(detections: Detections) -> tuple[Array, Array]:
@@ -587,9 +563,9 @@ def _nearest_of_side(detections: Detections) -> tuple[Array, Array]:
     variances, chosen = 0.5 * np.trace(covariances, axis1=1, axis2=2), list[int]()
     for k in np.argsort(np.hypot(*points.T)).tolist():
         apart = ((points[chosen] - points[k]) ** 2).sum(axis=1)
-        if (apart > SAME**2 * (variances[chosen] + variances[k])).all():
+        if (apart > 3.0**2 * (variances[chosen] + variances[k])).all():
             chosen.append(k)
-        if len(chosen) == PARTNERS:
+        if len(chosen) == 10:
             break
     return points[chosen], np.sqrt(variances[chosen])
 
@@ -607,7 +583,6 @@ def _from_line(points: Array, corners: Array) -> Array:
 NO_LABEL_WORDS: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
 # causes of a refusal, by the size of numbers; labels and frames are never the cause
 REFUSABLE: Final = {"stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances"}
-SHOWN_WORDS: Final = 3  # largest number of foreign labels in a hint
 
 
 def read_usable_log(folder: Path, limits: LimitSettings, scale: float | None = None) -> Log:
@@ -658,5 +633,5 @@ def _foreign_label_hints(folder: Path, log: Log) -> list[Hint]:
         return []
     met = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"])
     foreign = [word for word, _ in met.most_common() if word.strip().lower() not in NO_LABEL_WORDS]
-    words = ", ".join(map(shown, foreign[:SHOWN_WORDS]))
+    words = ", ".join(map(shown, foreign[:3]))
     return [hint_of("foreign labels", words=words)] if foreign else []
