@@ -50,9 +50,7 @@ def curvature(first: Array, second: Array) -> Array:
 
 
 STEP: Final = 0.25  # distance of the samples of a curve that is fitted (m)
-KNOT_STEP: Final = 0.5  # distance of the knots of the finished curve (m)
 SMOOTHING: Final = 1.0  # sigma of the Gaussian (m), which cuts a corner of radius R by its square / 2R
-CENTRINGS: Final = 4  # times that the curve is moved to equal distances from both rows and smoothed
 NEIGHBOURS: Final = 3  # cones to both sides of a sample's, up to which its distance to a row is measured
 START_CANDIDATES: Final = 4  # cones of each row nearest to the start, tried as the first pair
 
@@ -101,7 +99,7 @@ def fit_centre_line(left: Array, right: Array, closed: bool, near: Array) -> Cen
     def distances(curve: Array) -> list[Array]:
         return [_row_distances(curve, row, k, closed) for row, k in zip((left, right), index, strict=True)]
 
-    for _ in range(CENTRINGS):
+    for _ in range(4):  # moved to equal distances from both rows, and smoothed
         to_left, to_right = distances(curve)
         curve = _smooth(curve + _normals(curve, closed) * (to_left - to_right)[:, None] / 2, closed)
     return _as_spline(curve, np.minimum(*distances(curve)), closed)
@@ -181,7 +179,7 @@ def _row_distances(curve: Array, row: Array, index: IntArray, closed: bool) -> A
 
 
 def _as_spline(curve: Array, clearance: Array, closed: bool) -> CentreLine:
-    knots, index = resample(curve, KNOT_STEP, closed)
+    knots, index = resample(curve, 0.5, closed)
     at_knots = np.interp(index, np.arange(len(curve)), clearance)
     if closed:
         knots, at_knots = ring(knots), np.append(at_knots, at_knots[0])

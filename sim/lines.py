@@ -22,8 +22,6 @@ from .track import Track
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-TRUE_SPACING: Final = 1.0  # greatest distance of the points of a true boundary (m)
-
 
 @dataclass(frozen=True)
 class LineSettings(Checked, group="line"):
@@ -85,7 +83,7 @@ def as_lines(track: Track) -> Track:
     rows = []
     for cones in (track.left, track.right):
         curve = BoundaryCurve(cones, track.closed)
-        count = int(np.ceil(curve.length / TRUE_SPACING))
+        count = int(np.ceil(curve.length))  # points are a metre apart at most
         rows.append(curve.points(np.linspace(0.0, curve.length, count + 1)[: count + (not track.closed)]))
     return replace(track, left=rows[0], right=rows[1], other=np.zeros((0, 2)), other_labels=None)
 

@@ -19,9 +19,7 @@ from .track import Track
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-PATH_STEP: Final = 0.25  # distance of the samples of the driven path (m)
 WAVES: Final = 8  # number of sines whose sum is the wander
-MIN_PATH: Final = 10  # least number of samples of a path
 
 
 @dataclass(frozen=True)
@@ -124,7 +122,7 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
     total = laps * line.length + settings.overrun if line.closed else line.length - start
     if total <= 0.0:
         raise SettingsError(f"vehicle.overrun: expected a drive, found none of {total:g} m")
-    s = np.linspace(0.0, total, max(int(total / PATH_STEP), MIN_PATH))
+    s = np.linspace(0.0, total, max(int(total / 0.25), 10))
     at = (start + s) % line.length if line.closed else start + s
     normals = left_normals(line.tangents(at))
     offset = _wander(s, line.clearances(at), settings, rng) + _settling(line, start, track.start, s, settings)

@@ -21,9 +21,6 @@ from pathspace_graph.spline.crossing import crossed_boundaries, crossings_told
 
 from .outcome import Outcome
 
-ALONG_THE_ROAD = ("centerline", "profile", "geojson", "lanelet2")  # formats that say where to drive
-ON_EARTH = ("geojson", "lanelet2")  # formats that have latitude and longitude
-
 
 def export_command(options: Export) -> Outcome:
     check_file_target(options.out)
@@ -32,7 +29,7 @@ def export_command(options: Export) -> Outcome:
         raise SettingsError(f"--step: {expected}, found {options.step:g}")
     if options.format != "profile" and (options.stop or options.start_speed is not None):
         raise SettingsError(f"--start-speed, --stop: expected --as profile, found --as {options.format}")
-    if options.format in ON_EARTH and options.origin is None:
+    if options.format in ("geojson", "lanelet2") and options.origin is None:
         expected = "expected LATITUDE LONGITUDE HEADING in degrees, the heading clockwise from north"
         raise SettingsError(f"--origin: {expected}, found none, which --as {options.format} needs")
     plane = None if options.origin is None else LocalPlane(*options.origin)
@@ -42,7 +39,7 @@ def export_command(options: Export) -> Outcome:
         return Outcome([options.out])
     track = read_map(options.map)
     check_length(track, options.step, file)
-    if options.format in ALONG_THE_ROAD:
+    if options.format not in ("points", "tum"):  # the others say where to drive
         check_crossings(track, options.map)
     with atomic_file(options.out) as temporary:
         try:

@@ -37,7 +37,6 @@ SUPPORTED: Final = {  # contents that a message must have, by the option of its 
     "transforms": "transforms",
 }
 STATIC: Final = "/tf_static"  # topic of the transforms between frames that are fixed to the vehicle
-BODIES: Final = ("base_link", "base_footprint")  # frames of a vehicle whose odometry names none
 LEVEL: Final = 0.98  # least cosine of a level sensor's z axis and the vehicle's
 
 
@@ -139,7 +138,7 @@ def _mounting(
         otherwise = "--mounting 0 0 0 takes them as in the vehicle frame"
         raise InputError(path, f"{detections.name}: {expected}, {found}; {otherwise}")
     named = {one.header.frame_id.lstrip("/") for one in static}
-    body = first.body or next((name for name in BODIES if name in named), "")
+    body = first.body or next((name for name in ("base_link", "base_footprint") if name in named), "")
     others = sorted(frames - {body})
     if not body or not others:
         return None

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -15,12 +14,6 @@ from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from .messages import ALONE, Points
 from .settings import LEAST_SPACING, Frames
 
-SPACING_SHARE: Final = 0.15  # spacing by the median range, which has the size of the scene
-WALL_SAMPLES: Final = 1_000_000  # of the driven path
-WALL_STRETCH: Final = 2.0  # reach along the path, ahead and behind, in ranges of the point
-WALL_FARTHEST: Final = 3.0  # distance of a boundary point from the path, in distances of the median point
-NEXT_LINE: Final = 1.5  # distance of a polyline from the path, in distances of the nearest one on its side
-
 
 def are_lines(points: Points, spacing: float | None) -> bool:
     """Whether a record has points of lines: a spacing is stated, or no point stands alone."""
@@ -28,8 +21,8 @@ def are_lines(points: Points, spacing: float | None) -> bool:
 
 
 def default_spacing(points: Points) -> float:
-    """Spacing (m) of a record that states none."""
-    return max(SPACING_SHARE * float(np.median(np.hypot(*points.points.T))), LEAST_SPACING)
+    """Spacing (m) of a record that states none, by the median range, which has the size of the scene."""
+    return max(0.15 * float(np.median(np.hypot(*points.points.T))), LEAST_SPACING)
 
 
 def lines_of(
@@ -58,7 +51,7 @@ def lines_of(
     away = np.concatenate(lateral)
     known = np.abs(away[np.isfinite(away)])
     if len(known):
-        kept &= ~(np.abs(away) > WALL_FARTHEST * np.median(known))
+        kept &= ~(np.abs(away) > 3.0 * np.median(known))
     labels = np.select(
         [found.labels != UNKNOWN, away > 0.0, away < 0.0], [found.labels, LEFT, RIGHT], UNKNOWN
     )
@@ -79,7 +72,7 @@ def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
     middles = np.array([np.nanmedian(lateral[lines == line]) for line in numbers])
     for side in (1.0, -1.0):
         away = np.where(side * middles > 0.0, side * middles, np.inf)
-        far = numbers[(away > NEXT_LINE * away.min(initial=np.inf)) & np.isfinite(away)]
+        far = numbers[(away > 1.5 * away.min(initial=np.inf)) & np.isfinite(away)]
         kept &= ~np.isin(lines, far)
     return kept
 
@@ -131,7 +124,7 @@ class DrivenPath:
         moves = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
         poses = np.vstack([np.zeros(3), moves])
         s = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-        at = np.linspace(0.0, s[-1], int(min(np.ceil(s[-1] / step), WALL_SAMPLES)) + 1)
+        at = np.linspace(0.0, s[-1], int(min(np.ceil(s[-1] / step), 1_000_000)) + 1)
         moved = np.diff(s, prepend=-1.0) > 0.0
         points = np.column_stack([np.interp(at, s[moved], poses[moved, k]) for k in range(2)])
         return cls(odometry.t, poses, s, points, at)
@@ -144,7 +137,7 @@ class DrivenPath:
         """
         x, y, heading, here = (np.interp(t, self.t, of) for of in (*self.poses.T, self.s))
         placed = points @ rotation(float(heading)).T + np.array([x, y])
-        reach = WALL_STRETCH * np.hypot(*points.T)
+        reach = 2.0 * np.hypot(*points.T)  # along the path, ahead and behind
         near = np.abs(self.at - here) <= reach.max(initial=0.0)
         path, at = self.points[near], self.at[near]
         if len(path) < 2:

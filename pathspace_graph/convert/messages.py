@@ -21,14 +21,10 @@ LIST_NAMES: Final = {  # labels of the cones in a list with such a word in its n
 }
 CLOUD_TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # by `datatype`
 POINT_MARKERS: Final = (1, 2, 3, 10)  # types of markers that are one point: cube, sphere, cylinder, mesh
-LIST_MARKERS: Final = (6, 7, 8)  # types of markers that are lists of points: cubes, spheres, points
 LINE_STRIP: Final = 4  # type of a marker that is a polyline
 ALONE: Final = -1  # in place of the number of a polyline: a point that stands alone, as a cone does
 DENSE: Final = -2  # a point of a scan, anywhere along a line or a wall
-ADDED: Final = 0  # action of a marker that is added; others are taken away
 POSITIONS: Final = ("point", "position", "location", "center", "pose", "bbox")  # of a cone without x and y
-SPEEDS: Final = ("speed", "data", "vx")  # fields of a speed alone
-YAW_RATES: Final = ("wz", "yaw_rate")  # fields of a yaw rate beside it
 
 
 class MessageError(PathspaceError):
@@ -118,7 +114,7 @@ def twist_of(message: Any, wheelbase: float | None = None) -> Array | None:
     if hasattr(twist, "linear") and hasattr(twist, "angular"):
         return np.array([twist.linear.x, twist.linear.y, twist.angular.z], dtype=float)
     drive = getattr(message, "drive", message)
-    speed, rate = (first_of(drive, names) for names in (SPEEDS, YAW_RATES))
+    speed, rate = (first_of(drive, names) for names in (("speed", "data", "vx"), ("wz", "yaw_rate")))
     if isinstance(speed, Real):
         if hasattr(drive, "steering_angle") and wheelbase is not None:
             rate = speed * np.tan(drive.steering_angle) / wheelbase
@@ -240,8 +236,8 @@ def marker_points(array: Any, rule: LabelRule, namespaces: Sequence[str] = ()) -
 
 
 def _added(markers: Iterable[Any]) -> Iterator[Any]:
-    known = (*POINT_MARKERS, *LIST_MARKERS, LINE_STRIP)
-    return (marker for marker in markers if marker.action == ADDED and marker.type in known)
+    known = (*POINT_MARKERS, LINE_STRIP, 6, 7, 8)  # the last are lists of cubes, spheres and points
+    return (marker for marker in markers if marker.action == 0 and marker.type in known)
 
 
 def namespaces_of(message: Any) -> list[str]:

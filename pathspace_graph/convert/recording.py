@@ -22,14 +22,9 @@ from .lines import are_lines, in_vehicle, lines_of
 from .messages import ALONE, Points
 from .settings import Frames, NoiseSettings, Window
 
-MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
 MAX_DISORDER: Final = 2.0  # largest fall of stamps (s) from one message to the next of one clock
-SHORTEST: Final = 1e-6  # least time (s) that gives a rate; a bag of one message has 1 ns
 MOST_PLACES: Final = 5  # number of rows that are named
-REPEATED: Final = 0.02  # distance (m) below which two detections of a message are one
-PAIRED: Final = 0.25  # distance of two detections of one cone, by that of the next one beside them
 APART: Final = 1e6  # distance (m) of two messages where places are compared; no detection is as far
-MOST_PAIRED: Final = 0.5  # share of detections in such pairs from which each cone was reported twice
 # notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
@@ -78,7 +73,7 @@ class Recording:
 
 def rate(count: int, seconds: float) -> str:
     """Rate of something in words, unknown where no time (s) passed."""
-    return f"{count / seconds:.3g} Hz" if count > 1 and seconds > SHORTEST else "an unknown rate"
+    return f"{count / seconds:.3g} Hz" if count > 1 and seconds > 1e-6 else "an unknown rate"
 
 
 def check_clock(t: Array, what: str, file: Path) -> None:
@@ -331,7 +326,7 @@ def distinct(found: Points, notes: Counter[str]) -> Points:
     found = usable(found, notes)
     without = ~np.isfinite(found.covariances).all(axis=(1, 2))
     order = np.lexsort((without, found.labels == UNKNOWN))
-    pairs = KDTree(_places(found)[order]).query_pairs(REPEATED, output_type="ndarray")
+    pairs = KDTree(_places(found)[order]).query_pairs(0.02, output_type="ndarray")
     if not len(pairs):
         return found
     repeats = order[np.unique(pairs.max(axis=1))]
@@ -345,12 +340,12 @@ def _places(points: Points) -> Array:
 
 
 def pairs_of_cones(points: Points, most: float | None = None) -> IntArray:
-    """Pairs (k, 2) of points nearest to one another, and far from all others, or `most` apart (m)."""
+    """Pairs (k, 2) of points nearest to one another, a quarter as far as all others, or `most` apart (m)."""
     if len(points.labels) < 3:
         return np.zeros((0, 2), int)
     found = KDTree(_places(points)).query(_places(points), 3)
     (_, first, second), (_, other, _) = np.asarray(found[0]).T, np.asarray(found[1]).T
-    own, close = np.arange(len(other)), first < (PAIRED * second if most is None else most)
+    own, close = np.arange(len(other)), first < (0.25 * second if most is None else most)
     mutual = close & close[other] & (other[other] == own) & (own < other) & (second < APART)
     return np.asarray(np.column_stack([own, other])[mutual])
 
@@ -358,7 +353,7 @@ def pairs_of_cones(points: Points, most: float | None = None) -> IntArray:
 def merged_pairs(found: Points, notes: Counter[str]) -> Points:
     """Merge two detections of each cone to their mean, where most cones were reported twice."""
     pairs = pairs_of_cones(found)
-    if 2 * len(pairs) <= MOST_PAIRED * len(found.labels):
+    if 4 * len(pairs) <= len(found.labels):
         return found
     usual = float(np.median(np.hypot(*(found.points[pairs[:, 1]] - found.points[pairs[:, 0]]).T)))
     one, other = pairs_of_cones(found, 2.0 * usual).T
@@ -397,6 +392,6 @@ def positive_definite(covariances: Array) -> BoolArray:
     xx, xy, yx, yy = covariances.reshape(-1, 4).T
     with np.errstate(over="ignore", invalid="ignore"):
         good = np.isfinite(covariances).all(axis=(1, 2)) & is_positive_definite(xx, xy, yy)
-        good &= np.abs(xy - yx) <= MAX_ASYMMETRY * np.maximum(xx, yy)
+        good &= np.abs(xy - yx) <= 1e-3 * np.maximum(xx, yy)  # messages in single precision
         good &= np.maximum(xx, yy) < MAX_RANGE**2
     return np.asarray(good)

@@ -21,13 +21,10 @@ Side = Literal["left", "right"]  # side of the x axis to which the y axis points
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
 NO_LABEL: Final = "none"  # name of a label field that means no labels
 LEAST_SPACING: Final = 1e-3  # of points along a line (m)
-DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers by default
 SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
 ORANGE_WORDS: Final = {"orange", "o"}
 BIG_WORDS: Final = {"big", "large"}
-MOST_SHOWN: Final = 12  # number of label values in a line
 HUES: Final = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)}  # in degrees
-MIN_SATURATION: Final = 0.3  # least saturation of a colour that is not grey
 
 
 @dataclass(frozen=True)
@@ -166,7 +163,7 @@ class LabelRule:
         self.fields = (field,) if field else LABEL_FIELDS
         self._labels: dict[str, int] = {}
         self.met: Counter[tuple[str, int]] = Counter()  # values, by their text and the label they got
-        for pair in pairs or DEFAULT_LABELS:
+        for pair in pairs or ("left=0", "right=1"):
             name, equals, value = pair.partition("=")
             if not equals or name not in NAMES or not value:
                 raise SettingsError(f"--labels: expected LABEL=VALUE with a LABEL of {NAMES}, found '{pair}'")
@@ -190,7 +187,7 @@ class LabelRule:
 
     def summary(self) -> str:
         """One line with the labels of the most frequent values; empty where there are none."""
-        most = self.met.most_common(MOST_SHOWN)
+        most = self.met.most_common(12)
         values = [f"{text or 'empty'} is {NAMES[label]} ({count})" for (text, label), count in most]
         return f"labels: {', '.join(values)}{', ...' * (len(self.met) > len(most))}" if values else ""
 
@@ -216,7 +213,7 @@ def label_of_words(text: str) -> int:
 def label_of_colour(red: float, green: float, blue: float) -> int:
     """Label of a blue, yellow or orange colour, UNKNOWN of any other; the scale is free."""
     most, least = max(red, green, blue), min(red, green, blue)
-    if not 0.0 < most < inf or not most - least > MIN_SATURATION * most:
+    if not 0.0 < most < inf or not most - least > 0.3 * most:  # it is grey
         return UNKNOWN
     hue = 360.0 * rgb_to_hsv(red, green, blue)[0]
     labels = [label for label, (low, high) in HUES.items() if low <= hue <= high]

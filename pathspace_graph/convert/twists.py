@@ -15,14 +15,11 @@ from pathspace_graph.settings.online import LimitSettings
 LIMITS: Final = LimitSettings()  # beyond which no estimator uses a twist
 ACCELERATIONS: Final = np.array([20.0, 20.0, 15.0])  # that no vehicle exceeds (m/s^2, m/s^2, rad/s^2)
 AROUND: Final = 5  # number of rows before a row, and after it, whose medians it is compared with
-NOISE_SIGMAS: Final = 6.0  # noise of a row that may leave the medians around it, in standard deviations
 MAD: Final = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 WRAP_SHARE: Final = 0.7  # share of half a turn in a row that marks a yaw that was differenced where it wraps
 MOST_WRONG: Final = 0.05  # largest share of rows that are mistakes of single rows
 FEW: Final = 6  # number of rows that jump that are mistakes in any record
 FROZEN: Final = 1.2  # longest time (s) for which a repeated pose is one that was not measured anew
-MANY: Final = 20  # number of samples from which their period is known
-SLOW: Final = 0.12  # longest period (s) of sampled twists that are held; slower ones are interpolated
 PERIOD: Final = 0.05  # longest part (s) of an interval that is interpolated
 GAP: Final = 2.5  # a longer interval, in median ones, is a gap, over which nothing is interpolated
 
@@ -90,16 +87,19 @@ def jumps(t: Array, twists: Array) -> Array:
     off = twists - np.clip(twists, low, high)
     middle = 0.5 * (twists[:-2] + twists[2:])
     sigma = MAD * np.median(np.abs(twists[1:-1] - middle), axis=0) / np.sqrt(1.5)
-    most = 0.5 * AROUND * ACCELERATIONS * apart[:, None] + NOISE_SIGMAS * sigma
+    most = 0.5 * AROUND * ACCELERATIONS * apart[:, None] + 6.0 * sigma
     most[:, 2] = np.where(apart < 1.5 * dt, np.minimum(most[:, 2], WRAP_SHARE * np.pi / dt), most[:, 2])
     return np.where(np.abs(off) > most, off, 0.0)
 
 
 def parts_of(t: Array) -> int:
-    """Number of parts of an interval of sampled twists at t (n,) in s, each `PERIOD` long at most."""
+    """Number of parts of an interval of sampled twists at t (n,) in s, each `PERIOD` long at most.
+
+    It is 1 for periods up to 0.12 s, which can be held, and for too few samples to know their period.
+    """
     steps = np.diff(np.unique(t[np.isfinite(t)]))
-    period = float(np.median(steps)) if len(steps) >= MANY else 0.0
-    return int(np.ceil(period / PERIOD - 1e-6)) if period > SLOW else 1
+    period = float(np.median(steps)) if len(steps) >= 20 else 0.0
+    return int(np.ceil(period / PERIOD - 1e-6)) if period > 0.12 else 1
 
 
 def interpolated(t: Array, twists: Array, parts: int) -> Odometry:

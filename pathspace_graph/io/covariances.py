@@ -8,8 +8,6 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, BoolArray
 
 SIGMA_DETECTIONS: Final = (0.05, 0.012, np.pi / 200.0)  # (m, m/m, rad) where nothing is known
-MIN_RANGE_OF_BEARING: Final = 1.0  # least range (m) at which a bearing's sigma counts, for K > 0 at 0
-MIN_RELATIVE_DETERMINANT: Final = 1e-12  # least det over xx * yy: singular to double precision below
 
 
 def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
@@ -30,12 +28,12 @@ def ray_covariances(points: Array, sigmas: Iterable[float]) -> Array:
     """
     ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
     begin, growth, bearing = sigmas
-    across = (np.maximum(ranges, MIN_RANGE_OF_BEARING) * bearing) ** 2
+    across = (np.maximum(ranges, 1.0) * bearing) ** 2  # K > 0 at the sensor, too
     return polar_covariances(bearings, (begin + growth * ranges) ** 2, across)
 
 
 def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:
     """Which covariances (m,) are positive definite, by their entries."""
     with np.errstate(over="ignore", invalid="ignore"):
-        good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > MIN_RELATIVE_DETERMINANT * xx * yy)
+        good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > 1e-12 * xx * yy)  # singular to doubles below
     return np.asarray(good)

@@ -57,11 +57,9 @@ def crossings_of(result: RunResult) -> list[Crossing]:
     return crossed_boundaries(result.map.splines, path[:, :2], known)
 
 
-NOISE_RANGE: Final = 10.0  # range at which the noise of detections is reported (m)
 CLEAR_ERROR: Final = 4.0  # standard deviations beyond which a measured error of the sensor is reported
 # size beyond which it is reported (rad, m, s, -, m)
 ERROR_WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_scale": 0.01, "range_bias": 0.05}
-CORRELATED_SHARE: Final = 0.1  # share of the variance from which correlated errors are reported
 
 
 def noise_lines(noise: RunNoise | None) -> list[str]:
@@ -83,10 +81,10 @@ def measured_line(measured: MeasuredNoise) -> str:
     line = f"measured: odometry {forward} m/s, {sideways} m/s, {turning} rad/s from sample to sample"
     if measured.along is None or measured.across is None:
         return line
-    rays, at = (measured.along, measured.across), NOISE_RANGE
+    rays, at = (measured.along, measured.across), 10.0
     along, across = (float(ray.sigmas(np.array([at]))[0]) for ray in rays)
     line += f"; detections {along:.2g} m along and {across:.2g} m across the ray at {at:g} m"
-    if max(ray.share for ray in rays) > CORRELATED_SHARE:
+    if max(ray.share for ray in rays) > 0.1:
         shares = " and ".join(f"{100.0 * ray.share:.0f} %" for ray in rays)
         times = " and ".join(f"{ray.time:g} s" for ray in rays)
         line += f", of which {shares} of the variance stay with a cone for {times}"

@@ -531,7 +531,7 @@ def is_line(log: Log) -> bool | None:
                 seen.append((cycle.t, pose, points, sigmas))
         if not seen:
             continue
-        gaps = (KDTree(points).query(points[:COMPARED], k=2)[0] for _, _, points, _ in seen)
+        gaps = (np.asarray(KDTree(points).query(points[:COMPARED], k=2)[0]) for _, _, points, _ in seen)
         gap = float(np.median([np.median(apart[:, 1]) for apart in gaps]))
         for k, (t, pose, points, sigmas) in enumerate(seen):
             begin = int(np.searchsorted([one[0] for one in seen[:k]], t - LONGEST))

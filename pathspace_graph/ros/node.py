@@ -40,7 +40,6 @@ CENTRE: Final = 2  # identifier of the centre line among the lines
 COLOURS: Final = {LEFT: (0.0, 0.2, 1.0), RIGHT: (1.0, 0.9, 0.0), CENTRE: (1.0, 1.0, 1.0)}  # red, green, blue
 LINE_STRIP: Final = 4  # type of a `Marker` that is a line
 MOST_POSES: Final = 1000  # number of poses of the published path, by default
-MOST_ODOMETRY: Final = 500  # number of poses of the odometry that are remembered for a cycle
 BODY: Final = "base_link"  # frame of a vehicle whose odometry names none
 TRANSFORMS: Final = "/tf"
 
@@ -68,7 +67,7 @@ class Bridge:
         self.frame, self.body = "", BODY  # frames of the odometry's pose and of the vehicle
         self._known = read_map(known) if known else None
         self._sigma = np.array(sigma, float)
-        self._odometry = deque[tuple[float, Array, Array]](maxlen=MOST_ODOMETRY)  # stamp, pose and twist
+        self._odometry = deque[tuple[float, Array, Array]](maxlen=500)  # stamp, pose and twist
 
     def take_odometry(self, message: Any, received: float) -> None:
         """Take a message with odometry, received at a time (s)."""

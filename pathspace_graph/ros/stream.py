@@ -3,7 +3,7 @@
 from bisect import insort
 from collections import Counter, deque
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +15,6 @@ from pathspace_graph.convert.twists import beyond_limits
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Detections, Odometry
 
-MAX_BUFFERED: Final = 10_000  # largest number of twists that wait for a perception cycle
-
 
 class MessageStream:
     """Buffer of messages, which gives cycles in order, each with its twists; refused ones are counted.
@@ -27,7 +25,7 @@ class MessageStream:
     def __init__(self, frames: Frames | None = None, wait: float = 0.0) -> None:
         self.frames, self.noise, self.rule = frames or Frames(), NoiseSettings(), LabelRule()
         self.refused: Counter[str] = Counter()  # number of messages for each reason
-        self._twists: deque[tuple[float, list[float]]] = deque(maxlen=MAX_BUFFERED)
+        self._twists: deque[tuple[float, list[float]]] = deque(maxlen=10_000)
         self._first = np.inf  # the stamp (s) of the first twist
         self._wait = wait
         self._waiting = list[Detections]()  # in order of their stamps
