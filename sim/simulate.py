@@ -152,7 +152,7 @@ def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
 
 
 def _noise(settings: SimulationSettings) -> Array | None:
-    """Noise (6,) in the order of `io.header:TRUE_ERRORS`, or None where all of it is white."""
+    """Noise (6,) in the order of `io.log_files:TRUE_ERRORS`, or None where all of it is white."""
     odometry, sensor = settings.odometry, settings.sensor
     if not (any(odometry.slow) or sensor.slow_range or sensor.slow_bearing):
         return None

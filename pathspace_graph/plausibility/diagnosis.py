@@ -6,9 +6,9 @@ from typing import Any, Final
 import numpy as np
 
 from pathspace_graph.factors.noise import MeasuredNoise
+from pathspace_graph.factors.odometry import CALIBRATION
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import LOST
-from pathspace_graph.io.header import CALIBRATION
 from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
 from pathspace_graph.spline.crossing import Crossing, crossed_boundaries
 
