@@ -90,7 +90,7 @@ def _convert(options: Convert, source: Path, out: Path) -> None:
         recorded = to_log(record, options.frames, options.noise, source, options.window.spacing)
         log = with_measured_noise(replace(recorded, scale=options.scale), record.parts)
         write_checked(log, out, source, force=options.force)
-    report(record.notes, rule, log)
+    tell_log(record.notes, rule, log)
     tell(hints(log))
 
 
@@ -154,24 +154,19 @@ def write_checked(log: Log, out: Path, source: Path, *, force: bool) -> None:
         raise InputError(source, f"its log would be refused ({where}): {why}; {part}") from None
 
 
-def report(notes: Counter[str], rule: LabelRule, log: Log) -> None:
-    """Print the meaning of labels, what was dropped or assumed and how often, and a summary of the log."""
-    say(*(f"{count} {text}" for text, count in notes.items() if count))
-    measured = [] if log.measured is None else [measured_line(scaled(log.measured, 1.0 / log.scale))]
-    labels = [rule.summary()] if rule.met else []
-    say(*labels, outline(log), *measured, describe(log))
-
-
-def outline(log: Log) -> str:
-    """One line about the log: rates, speeds, ranges and labels."""
+def tell_log(notes: Counter[str], rule: LabelRule, log: Log) -> None:
+    """Print what was dropped or assumed and how often, labels, rates, speeds, ranges and the length."""
     twists, seconds = log.odometry.twist, float(np.ptp(log.odometry.t))
     ranges = np.concatenate([np.hypot(*cycle.points_vehicle.T) for cycle in log.cycles])
     labels = np.bincount(np.concatenate([cycle.labels for cycle in log.cycles]), minlength=len(NAMES))
-    counted = ", ".join(
-        f"{count} {name}" for name, count in zip(NAMES, labels.tolist(), strict=True) if count
-    )
-    return (
+    counted = [f"{count} {name}" for name, count in zip(NAMES, labels.tolist(), strict=True) if count]
+    measured = [] if log.measured is None else [measured_line(scaled(log.measured, 1.0 / log.scale))]
+    say(
+        *(f"{count} {text}" for text, count in notes.items() if count),
+        *([rule.summary()] if rule.met else []),
         f"odometry at {rate(len(twists), seconds)}, up to {np.hypot(*twists[:, :2].T).max():.3g} m/s and "
         f"{np.abs(twists[:, 2]).max():.3g} rad/s; detections at {rate(len(log.cycles), seconds)}, "
-        f"{ranges.min():.3g} m to {ranges.max():.3g} m away: {counted}"
+        f"{ranges.min():.3g} m to {ranges.max():.3g} m away: {', '.join(counted)}",
+        *measured,
+        describe(log),
     )

@@ -260,23 +260,22 @@ def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
     if kind == "boundaries":
         return result
 
+    failed = list[SettingsError]()
+
     def line(track: Map) -> Map:
-        found = as_ribbon(scaled(track, 1.0 / result.scale), settings.spline.sigma_shape)
+        try:
+            found = as_ribbon(scaled(track, 1.0 / result.scale), settings.spline.sigma_shape)
+        except SettingsError as error:
+            failed.append(error)
+            return track
         return scaled(found, result.scale)
 
-    def line_if_any(track: Map) -> Map:
-        try:
-            return line(track)
-        except SettingsError:
-            return track
-
-    try:
-        last = line(result.map)
-    except SettingsError as error:
-        note(f"--map {kind}: {error}, and the map is of boundaries")
+    last = line(result.map)
+    if failed:
+        note(f"--map {kind}: {failed[0]}, and the map is of boundaries")
         return result
-    laps = tuple((lap, line_if_any(track)) for lap, track in result.lap_maps)
-    return replace(result, map=last, lap_maps=laps, snapshots=tuple(map(line_if_any, result.snapshots)))
+    laps = tuple((lap, line(track)) for lap, track in result.lap_maps)
+    return replace(result, map=last, lap_maps=laps, snapshots=tuple(map(line, result.snapshots)))
 
 
 def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pathspace_graph.io.export import LocalPlane
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE
 from pathspace_graph.io.log_files import read_log
-from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
+from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FILE, write_trajectory
 from pathspace_graph.io.tables import read_table, read_trajectory
 from pathspace_graph.options.map import Export
@@ -38,7 +38,11 @@ def export_command(options: Export) -> Outcome:
         write_true_path(options.map, options.out)
         return Outcome([options.out])
     track = read_map(options.map)
-    check_length(track, options.step, file)
+    most = MOST_POINTS * options.step
+    for curve in track.splines.values():
+        if (length := curve.length()) > most:
+            expected = f"expected curves of at most {most:g} m at this step"
+            raise InputError(file, f"{expected}, found {length:.6g} m")
     if options.format not in ("points", "tum"):  # the others say where to drive
         check_crossings(track, options.map)
     with atomic_file(options.out) as temporary:
@@ -86,13 +90,3 @@ def check_crossings(track: Map, folder: Path) -> None:
     crossed = crossings_told(crossed_boundaries(track.splines, path, known))
     if crossed:
         raise InputError(folder / MAP_FILE, f"expected the map of the drive in {file.name}: {crossed}")
-
-
-def check_length(track: Map, step: float, file: Path) -> None:
-    """Raise an InputError where a curve has too many points at this step (m)."""
-    most = MOST_POINTS * step
-    for boundary in track.boundaries.values():
-        length = boundary.spline.length() if isinstance(boundary, SplineBoundary) else 0.0
-        if length > most:
-            expected = f"expected curves of at most {most:g} m at this step"
-            raise InputError(file, f"{expected}, found {length:.6g} m")

@@ -19,8 +19,8 @@ from pathspace_graph.io.parsing import read_text
 from .messages import (
     MessageError,
     Points,
-    frame_of,
-    namespaces_of,
+    added,
+    frame_id_of,
     points_of,
     pose_of,
     stamp_of,
@@ -64,11 +64,11 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
 
     def motion(message: Any) -> Motion:
         twist = twist_of(message, options.wheelbase)
-        return Motion(twist, pose_of(message), frame_of(message), frame_of(message, "child_frame_id"))
+        return Motion(twist, pose_of(message), frame_id_of(message), frame_id_of(message, "child_frame_id"))
 
     def points(message: Any) -> tuple[str, Points]:
-        namespaces.update(namespaces_of(message))
-        return frame_of(message), points_of(message, rule, options.namespaces)
+        namespaces.update(marker.ns for marker in added(getattr(message, "markers", ())))
+        return frame_id_of(message), points_of(message, rule, options.namespaces)
 
     with closing(Bag(path, options, notes)) as bag:
         odometry = bag.samples(options.odometry, "--odometry", motion)

@@ -11,13 +11,8 @@ from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
-from .messages import ALONE, Points
+from .messages import Points
 from .settings import LEAST_SPACING, Frames
-
-
-def are_lines(points: Points, spacing: float | None) -> bool:
-    """Whether a record has points of lines: a spacing is stated, or no point stands alone."""
-    return spacing is not None or bool(len(points.lines) and (points.lines != ALONE).all())
 
 
 def default_spacing(points: Points) -> float:
@@ -44,8 +39,8 @@ def lines_of(
         f"points of lines are {spacing:.2g} m apart (--spacing), of {len(points.labels)} that were recorded"
     )
     notes[told] += len(found.labels)
-    path = DrivenPath.of(odometry, 0.5 * spacing)
-    places = [in_vehicle(scan.points, frames) for scan in scans]
+    path = ReckonedPath.of(odometry, 0.5 * spacing)
+    places = [from_sensor(scan.points, frames) for scan in scans]
     lateral = [path.lateral(float(at), own) for at, own in zip(t, places, strict=True)]
     kept = np.concatenate([nearest_lines(scan.lines, own) for scan, own in zip(scans, lateral, strict=True)])
     away = np.concatenate(lateral)
@@ -59,7 +54,7 @@ def lines_of(
     return found._replace(labels=labels).where(kept)
 
 
-def in_vehicle(points: Array, frames: Frames) -> Array:
+def from_sensor(points: Array, frames: Frames) -> Array:
     """Transform points (m, 2) of the sensor to the vehicle frame."""
     x, y, yaw = frames.mounting or (0.0, 0.0, 0.0)
     return np.asarray((points * frames.sides) @ rotation(yaw).T + np.array([x, y]))
@@ -79,7 +74,7 @@ def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
 
 def along_lines(points: Points, spacing: float) -> Points:
     """Interpolate polylines and thin dense points to a spacing (m)."""
-    parts = [points.where(thinned(points.points, spacing, points.lines < 0))]
+    parts = [points.where(spaced_apart(points.points, spacing, points.lines < 0))]
     for line in np.unique(points.lines[points.lines >= 0]):
         own = points.where(points.lines == line)
         placed = resampled(own.points, spacing)
@@ -95,7 +90,7 @@ def resampled(vertices: Array, spacing: float) -> Array:
     return np.column_stack([np.interp(at, s, vertices[:, 0]), np.interp(at, s, vertices[:, 1])])
 
 
-def thinned(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
+def spaced_apart(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
     """Indices of chosen points (m, 2) no two of which are nearer than the spacing (m).
 
     They are chosen by bearing, since by range the noise of the ranges would choose.
@@ -110,7 +105,7 @@ def thinned(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class DrivenPath:
+class ReckonedPath:
     """The path driven, by dead reckoning from the pose at the first twist."""
 
     t: Array  # (N,) stamps (s)
@@ -120,7 +115,7 @@ class DrivenPath:
     at: Array  # (k,) their path lengths (m)
 
     @classmethod
-    def of(cls, odometry: Odometry, step: float) -> "DrivenPath":
+    def of(cls, odometry: Odometry, step: float) -> "ReckonedPath":
         moves = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
         poses = np.vstack([np.zeros(3), moves])
         s = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))

@@ -84,7 +84,7 @@ class Points(NamedTuple):
 def header_of(message: Any) -> Any:
     """Header of a message, of the first point of an array of markers, or None."""
     if hasattr(message, "markers"):
-        return next((marker.header for marker in _added(message.markers)), None)
+        return next((marker.header for marker in added(message.markers)), None)
     return getattr(message, "header", None)
 
 
@@ -96,7 +96,7 @@ def stamp_of(message: Any) -> float | None:
     return float(header.stamp.sec + 1e-9 * header.stamp.nanosec)
 
 
-def frame_of(message: Any, name: str = "frame_id") -> str:
+def frame_id_of(message: Any, name: str = "frame_id") -> str:
     """Frame of a message by its header, or by this field of its own; empty where it has none."""
     frame = getattr(message, name, None) or getattr(header_of(message), name, "")
     return str(frame).lstrip("/")
@@ -218,7 +218,7 @@ def marker_points(array: Any, rule: LabelRule, namespaces: Sequence[str] = ()) -
     A strip of lines is a polyline. Markers are those of the namespaces, by default of all.
     """
     points, labels, lines = list[tuple[float, float]](), list[int](), list[int]()
-    for number, marker in enumerate(_added(array.markers)):
+    for number, marker in enumerate(added(array.markers)):
         if namespaces and marker.ns not in namespaces:
             continue
         at, colours = marker.pose.position, [marker.color]
@@ -235,14 +235,10 @@ def marker_points(array: Any, rule: LabelRule, namespaces: Sequence[str] = ()) -
     return Points.of(points, labels, lines=lines)
 
 
-def _added(markers: Iterable[Any]) -> Iterator[Any]:
+def added(markers: Iterable[Any]) -> Iterator[Any]:
+    """Yield the markers that are points or polylines and are not taken away."""
     known = (*POINT_MARKERS, LINE_STRIP, 6, 7, 8)  # the last are lists of cubes, spheres and points
     return (marker for marker in markers if marker.action == 0 and marker.type in known)
-
-
-def namespaces_of(message: Any) -> list[str]:
-    """Namespace of each marker of a message that is added; none of other messages."""
-    return [marker.ns for marker in _added(getattr(message, "markers", ()))]
 
 
 def cone_points(message: Any, rule: LabelRule) -> Points:

@@ -18,7 +18,7 @@ from pathspace_graph.io.parsing import MAX_RANGE, MAX_STAMP
 from pathspace_graph.labels import UNKNOWN
 
 from . import twists
-from .lines import are_lines, in_vehicle, lines_of
+from .lines import from_sensor, lines_of
 from .messages import ALONE, Points
 from .settings import Frames, NoiseSettings, Window
 
@@ -139,13 +139,14 @@ def to_log(
 ) -> Log:
     """Convert a record to a log; InputError of `file` if nothing is usable.
 
-    Points of lines are a spacing (m) apart, by default a share of their median range. Polylines beside points
+    Points are of lines where a spacing (m) is stated, or none stands alone; they are so far apart, by default
+    a share of their median range. Polylines beside points
     that stand alone are dropped, and so is what was reported twice.
     """
     frames, notes = replace(frames, mounting=frames.mounting or record.mounting), record.notes
     odometry = _odometry(record, frames, file)
     points, t = record.points, record.scan_t
-    is_line = are_lines(points, spacing)
+    is_line = spacing is not None or bool(len(points.lines) and (points.lines != ALONE).all())
     if is_line:
         points = lines_of(t, usable(points, notes), odometry, frames, spacing, notes)
     else:
@@ -162,7 +163,7 @@ def to_log(
         source=record.source,
         odometry_stated=noise.sigma_odometry is not None,
         odometry_drift=None if noise.sigma_drift is None else np.array(noise.sigma_drift),
-        detections_stated=noise.states_detections or not notes[ASSUMED],
+        detections_stated=any(own is not None for own in noise.of_detections) or not notes[ASSUMED],
     )
 
 
@@ -339,24 +340,22 @@ def _places(points: Points) -> Array:
     return np.column_stack([points.points, APART * points.message])
 
 
-def pairs_of_cones(points: Points, most: float | None = None) -> IntArray:
-    """Pairs (k, 2) of points nearest to one another, a quarter as far as all others, or `most` apart (m)."""
-    if len(points.labels) < 3:
-        return np.zeros((0, 2), int)
-    found = KDTree(_places(points)).query(_places(points), 3)
-    (_, first, second), (_, other, _) = np.asarray(found[0]).T, np.asarray(found[1]).T
-    own, close = np.arange(len(other)), first < (0.25 * second if most is None else most)
-    mutual = close & close[other] & (other[other] == own) & (own < other) & (second < APART)
-    return np.asarray(np.column_stack([own, other])[mutual])
-
-
 def merged_pairs(found: Points, notes: Counter[str]) -> Points:
-    """Merge two detections of each cone to their mean, where most cones were reported twice."""
-    pairs = pairs_of_cones(found)
-    if 4 * len(pairs) <= len(found.labels):
+    """Merge two detections of each cone to their mean, where most cones were reported twice.
+
+    These are nearer to one another than by a quarter of the distance of the next detection.
+    """
+    if len(found.labels) < 3:
         return found
-    usual = float(np.median(np.hypot(*(found.points[pairs[:, 1]] - found.points[pairs[:, 0]]).T)))
-    one, other = pairs_of_cones(found, 2.0 * usual).T
+    tree = KDTree(_places(found))
+    first, second = np.asarray(tree.query(tree.data, 3)[0])[:, 1:].T
+    paired = (first < 0.25 * second) & (second < APART)
+    if 2 * paired.sum() <= len(paired):
+        return found
+    usual = float(np.median(first[paired]))
+    pairs = tree.query_pairs(2.0 * usual, output_type="ndarray")
+    of_one_pair = np.bincount(pairs.ravel(), minlength=len(paired)) == 1
+    one, other = pairs[of_one_pair[pairs].all(axis=1)].T
     told = f"detections lie in pairs, {usual:.2g} m apart, and were merged to one a cone"
     notes[told] += 2 * len(one)
     labels, points, covariances = found.labels.copy(), found.points.copy(), found.covariances.copy()
@@ -384,7 +383,7 @@ def in_vehicle_frame(
     turn = rotation((frames.mounting or (0.0, 0.0, 0.0))[2])
     turned = turn @ covariances @ turn.T
     symmetric = 0.5 * (turned + turned.transpose(0, 2, 1))
-    return Detections(t, in_vehicle(found.points, frames), symmetric, found.labels)
+    return Detections(t, from_sensor(found.points, frames), symmetric, found.labels)
 
 
 def positive_definite(covariances: Array) -> BoolArray:

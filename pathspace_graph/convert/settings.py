@@ -83,19 +83,15 @@ class NoiseSettings(Checked, group=""):
             raise SettingsError("sigma_drift: expected sigma_odometry beside it, found none")
 
     @property
-    def _own(self) -> tuple[float | None, ...]:
+    def of_detections(self) -> tuple[float | None, ...]:
+        """What is stated of detections, in the order of `sigmas`."""
         return self.sigma_range, self.sigma_range_growth, self.sigma_bearing
 
     @property
     def sigmas(self) -> tuple[float, ...]:
         """Sigmas of the range at range 0 (m), of its growth (m/m), and of the bearing (rad)."""
-        pairs = zip(self._own, SIGMA_DETECTIONS, strict=True)
+        pairs = zip(self.of_detections, SIGMA_DETECTIONS, strict=True)
         return tuple(default if own is None else own for own, default in pairs)
-
-    @property
-    def states_detections(self) -> bool:
-        """Whether the noise of the detections is stated here."""
-        return any(own is not None for own in self._own)
 
 
 @dataclass(frozen=True)

@@ -234,8 +234,9 @@ class Log:
         K = np.asarray(ray_covariances(points, SIGMA_DETECTIONS) if m is None else m, float).reshape(-1, 4)
         words = [label_from_name(one) if isinstance(one, str) else one for one in labels or ()]
         labelled = words if labels is not None else np.full(len(points), UNKNOWN)
-        odometry = odometry_of(_of_arrays(ODOMETRY_FILE, t, twist))
-        found = _of_arrays(DETECTIONS_FILE, detection_t, points, labelled, K[:, [0, 1, 3]])
+        odometry = odometry_of(Table.of_arrays(Path("odometry"), COLUMNS[ODOMETRY_FILE], t, twist))
+        columns = COLUMNS[DETECTIONS_FILE]
+        found = Table.of_arrays(Path("detections"), columns, detection_t, points, labelled, K[:, [0, 1, 3]])
         return cls(
             odometry,
             cycles_in(found, float(odometry.t[0]), float(odometry.t[-1])),
@@ -256,10 +257,6 @@ class Log:
         stated = self.odometry_stated, self.detections_stated
         scale, drift = self.sensor.sigma_range_scale, self.odometry_drift
         return scaled(KnownNoise(self.odometry_sigma, *stated, self.measured, scale, drift), 1.0 / self.scale)
-
-
-def _of_arrays(name: str, *values: ArrayLike) -> Table:
-    return Table.of_arrays(Path(name).with_suffix(""), COLUMNS[name], *values)
 
 
 def odometry_of(table: Table) -> Odometry:

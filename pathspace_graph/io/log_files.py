@@ -222,7 +222,7 @@ def _to_toml(log: Log) -> str:
     for name, entries in TRUE_ERRORS.items():
         values = getattr(log.truth, name, None)
         truth |= {} if values is None else dict(zip(entries, values, strict=True))
-    sections = {
+    sections: dict[str, dict[str, Any]] = {
         "odometry": {"sigma": log.odometry_sigma, "drift_sigmas": log.odometry_drift},
         "sensor": vars(log.sensor),
         **noise_sections(log.odometry_stated, log.detections_stated, log.measured),
@@ -230,8 +230,8 @@ def _to_toml(log: Log) -> str:
         **({"truth": truth} if truth else {}),
     }
     lines = [f'format = "{FORMAT}"', *([] if log.scale == 1.0 else [f"scale = {_toml(log.scale)}"])]
-    for name, entries in sections.items():
-        known = {key: value for key, value in entries.items() if value is not None}
+    for name, section in sections.items():
+        known = {key: value for key, value in section.items() if value is not None}
         lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in known.items())]
     return "\n".join(lines) + "\n"
 

@@ -372,7 +372,7 @@ def as_ribbon(track: Map, sigma_shape: float) -> Map:
     `sigma_shape` (m) is what a ribbon cannot follow, one sigma, added to each control point of its edges.
     """
     ribbon, covariance, until = ribbon_of(track)
-    return replace(map_of(ribbon, covariance, sigma_shape, until), points=track.points)
+    return replace(map_of_ribbon(ribbon, covariance, sigma_shape, until), points=track.points)
 
 
 def ribbon_of(track: Map) -> tuple[Ribbon, Array | None, dict[int, float]]:
@@ -391,7 +391,9 @@ def ribbon_of(track: Map) -> tuple[Ribbon, Array | None, dict[int, float]]:
     return line.ribbon, None if P is None else line.by_boundaries @ P @ line.by_boundaries.T, until
 
 
-def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]) -> Map:
+def map_of_ribbon(
+    ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]
+) -> Map:
     """Build the map of the edges of a ribbon, with the covariance (3m, 3m) of its control points, if known.
 
     `sigma_shape` (m) is added to each control point. Open edges are confirmed up to the parameters `until`.

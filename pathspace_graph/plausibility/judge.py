@@ -113,10 +113,13 @@ def hints(log: Log) -> list[Hint]:
     stay = log.sensor.kind != "line" and not is_line(log)
     with threadpool_limits(limits=1):
         found += of_positions + of_rows + (camera(log) or motion_hints(log))
-        found = found or of_kind(log)
+        found = found or kind_hints(log)
         if not found and stay:
             found = one_label(log) + side_hints(log)
-    return of_cycles + (found or noise_hints(log, stay=stay))
+    if not found:
+        found += _odometry_hints(log) if log.odometry_stated else []
+        found += _detection_hints(log) if log.detections_stated and stay else []
+    return of_cycles + found
 
 
 # --- stamps, units and rows by typical values ------------------------------------------------------------
@@ -273,7 +276,7 @@ FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation 
 }
 
 
-def of_kind(log: Log) -> list[Hint]:
+def kind_hints(log: Log) -> list[Hint]:
     """Hint if detections are of the other kind than the log says, which is cones by default."""
     stated = log.sensor.kind or "cones"
     found = {True: "line", False: "cones", None: stated}[is_line(log)]
@@ -306,13 +309,13 @@ def motion_hints(log: Log) -> list[Hint]:
         return [hint_of("map frame", evidence=at_rest.words)]
     if unexplained and not lines and explained.both.mean() < UNEXPLAINED[1]:
         return unexplained
-    tell(told, why.get("content"), "pose" if fit.content == "pose" else "fixed frame")
+    add_hint(told, why.get("content"), "pose" if fit.content == "pose" else "fixed frame")
     when, before, after, jumping = regression.jump(fit)
     if jump := far_better(jumping, np.maximum(explained.both, rest.both)):
-        tell(told, jump, "clock jumps", seconds=after - before, when=when)
+        add_hint(told, jump, "clock jumps", seconds=after - before, when=when)
     else:
         late = why.get("lag") if abs(fit.lag) > 0.2 else None  # less (s) is left to the calibration
-        tell(told, late, "late" if fit.lag > 0.0 else "early", seconds=abs(fit.lag))
+        add_hint(told, late, "late" if fit.lag > 0.0 else "early", seconds=abs(fit.lag))
         tell_missing(told, regression, fit)
     if not may_rest and all(hint.cause != "speeds" for hint in told):
         tell_factors(told, regression, fit)
@@ -321,7 +324,7 @@ def motion_hints(log: Log) -> list[Hint]:
     return sorted(told, key=lambda hint: -told[hint]) or beyond_any_vehicle(log)
 
 
-def tell(told: Told, better: Better | None, mistake: str, **figures: Any) -> None:
+def add_hint(told: Told, better: Better | None, mistake: str, **figures: Any) -> None:
     if better is not None:
         told[hint_of(mistake, evidence=better.words, **figures)] = better.gain
 
@@ -336,13 +339,13 @@ def tell_missing(told: Told, regression: Regression, fit: Fit) -> None:
     speeds = {"stated": np.abs(stated_v).mean(), "seen": np.abs(shown_v).mean()}
     backward = regression.shares(np.where((v.conj() * shown_v).real < 0.0, -v, v), w)
     if turn and rates["stated"] < FLAT * rates["seen"]:
-        tell(told, turn, "no yaw rate", **rates)
+        add_hint(told, turn, "no yaw rate", **rates)
     elif way and speeds["stated"] < FLAT * speeds["seen"]:
-        tell(told, way, "no speed", **speeds)
+        add_hint(told, way, "no speed", **speeds)
     elif no_sign := far_better(backward.way, explained.way):
-        tell(told, no_sign, "no sign")
+        add_hint(told, no_sign, "no sign")
     elif seen.both.mean() > max(WELL_EXPLAINED, explained.both.mean() / 0.4):
-        tell(told, way or turn, "other drive", which="way" if way else "turns")
+        add_hint(told, way or turn, "other drive", which="way" if way else "turns")
 
 
 def tell_factors(told: Told, regression: Regression, fit: Fit) -> None:
@@ -353,13 +356,13 @@ def tell_factors(told: Told, regression: Regression, fit: Fit) -> None:
     speeds, rates = far_better(explained.way, of_speed.way), far_better(explained.turn, of_rate.turn)
     thousandth = {1e-3: "milliseconds"}
     if speeds and rates and unit_of(speed, thousandth) == unit_of(rate, thousandth):
-        tell(told, speeds, "milliseconds")
+        add_hint(told, speeds, "milliseconds")
         return
     for better, mistake, (unit, size) in (
         (speeds, "unit of speeds", unit_of(speed, SPEED_UNITS)),
         (rates, "unit of yaw rate", unit_of(rate, RATE_UNITS)),
     ):
-        tell(told, better if unit else None, mistake, unit=unit, size=size)
+        add_hint(told, better if unit else None, mistake, unit=unit, size=size)
 
 
 def unit_of(size: float, units: Mapping[float, str]) -> tuple[str, float]:
@@ -384,25 +387,25 @@ def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log) -> None:
     vx, vy = np.median(log.odometry.twist[:, :2], axis=0)
     of_axes = None
     if is_quarter and abs(quarter) == 90 and abs(vy) > abs(vx):
-        tell(told, better, "swapped")
+        add_hint(told, better, "swapped")
     elif is_quarter and quarter == 180 and not mirror and vx < 0.0 and np.median(_points(log).real) > 0.0:
-        tell(told, better, "backward")
+        add_hint(told, better, "backward")
     elif is_quarter and quarter:
         of_axes, (what, x, y) = better, FRAMES[quarter, bool(mirror)]
-        tell(told, better, "frame", what=what, x=x, y=y)
+        add_hint(told, better, "frame", what=what, x=x, y=y)
     elif abs(turn) > TURN_TOLD:
         angle = f"{abs(turn):.1f} degrees to the {'left' if turn > 0.0 else 'right'}"
         side, of_axes = ", with y to the right" if mirror else "", better or small
-        tell(told, of_axes, "turned", angle=angle, side=side, yaw=np.deg2rad(turn))
+        add_hint(told, of_axes, "turned", angle=angle, side=side, yaw=np.deg2rad(turn))
     if mirror and not of_axes:
         back = np.exp(1j * np.deg2rad(turn))
         of_detections = sided(log, back, mirrored=True) >= sided(log, np.conj(back))
-        tell(told, mirror, "y to the right" if of_detections else "yaw rate to the right")
+        add_hint(told, mirror, "y to the right" if of_detections else "yaw rate to the right")
     # a lever of a metre, known to a fifth
     if clear and abs(fit.lever) > max(1.0, fit.sigmas[1] / 0.2):
         place = fit.lever * np.conj(fit.gain) / size
         ahead, left = place.real, -place.imag if mirror else place.imag
-        tell(told, sure, "place", ahead=ahead, left=left, along=f"{ahead:+.2f}", aside=f"{left:+.2f}")
+        add_hint(told, sure, "place", ahead=ahead, left=left, along=f"{ahead:+.2f}", aside=f"{left:+.2f}")
 
 
 def side_hints(log: Log) -> list[Hint]:
@@ -427,15 +430,6 @@ def side_hints(log: Log) -> list[Hint]:
 NOISE_FACTOR: Final = 1.5  # least ratio of measured and stated noise of the odometry for a hint
 SCATTER_FACTOR: Final = 2.0  # least ratio of measured and stated noise of detections for a hint
 UNIT_FACTOR: Final = 10.0  # least ratio that tells another unit
-
-
-def noise_hints(log: Log, *, stay: bool = True) -> list[Hint]:
-    """Hints where the readings of a log contradict the stated noise by a large factor.
-
-    The noise of detections is measurable only if they `stay` in place, as cones do.
-    """
-    found = _odometry_hints(log) if log.odometry_stated else []
-    return found + (_detection_hints(log) if log.detections_stated and stay else [])
 
 
 def _odometry_hints(log: Log) -> list[Hint]:

@@ -86,7 +86,7 @@ def motions_of(
             share, motion, information = register(cycles[k], cycles[k + gap], starts, fastest * dt, fewest)
             tried += 1
             if share > MATCHED and np.linalg.cond(information) < 1e8:
-                twist = twist_of(motion, dt)
+                twist = mean_twist(motion, dt)
                 rows.append([stamps[k], stamps[k + gap], *twist, *(np.linalg.inv(information) / dt**2).flat])
     table = np.array(sorted(rows, key=lambda row: row[0] + row[1])).reshape(-1, 14)
     begin, end, vx, vy, rate = table[:, :5].T
@@ -124,7 +124,7 @@ def register(
     return best
 
 
-def twist_of(motion: Array, dt: float) -> Array:
+def mean_twist(motion: Array, dt: float) -> Array:
     """Return the constant twist (3,) of a motion (3,) in a time dt (s)."""
     turn = motion[2]
     way = (motion[0] + 1j * motion[1]) * np.exp(-0.5j * turn) / np.sinc(turn / (2.0 * pi))

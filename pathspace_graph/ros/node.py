@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.convert.messages import BROKEN, frame_of, pose_of, stamp_of
+from pathspace_graph.convert.messages import BROKEN, frame_id_of, pose_of, stamp_of
 from pathspace_graph.convert.recording import ASSUMED
 from pathspace_graph.convert.settings import Frames
 from pathspace_graph.errors import PathspaceError, SettingsError
@@ -75,9 +75,9 @@ class Bridge:
             return
         with suppress(*BROKEN):
             pose, t = pose_of(message), stamp_of(message) or received
-            self.body = frame_of(message, "child_frame_id") or self.body
+            self.body = frame_id_of(message, "child_frame_id") or self.body
             if pose is not None and np.isfinite(pose).all():
-                self.frame = frame_of(message)
+                self.frame = frame_id_of(message)
                 self._odometry.append((t, pose, self.stream.newest_twist))
 
     def update(self, message: Any, received: float) -> CycleResult | None:
@@ -132,7 +132,7 @@ class Bridge:
         return made.absolute()
 
 
-def boundary_points(track: Map) -> dict[int, Array]:
+def curve_points(track: Map) -> dict[int, Array]:
     """Sample points (n, 2) along each boundary, in m, map frame."""
     points = {}
     for label, boundary in track.boundaries.items():
@@ -186,7 +186,7 @@ def publisher(
         seconds, nanoseconds = divmod(round(result.t * 1e9), 10**9)
         stamp = Time(sec=seconds, nanosec=nanoseconds)
         header, ahead = Header(frame_id="map", stamp=stamp), bridge.mapper.ahead(AHEAD)
-        to_map.publish(lines(boundary_points(bridge.mapper.outline()), header))
+        to_map.publish(lines(curve_points(bridge.mapper.outline()), header))
         near = {LEFT: ahead.left, RIGHT: ahead.right, CENTRE: ahead.points}
         to_ahead.publish(lines(near, Header(frame_id=bridge.body, stamp=stamp)))
         at = PoseStamped(header=header)

@@ -12,7 +12,7 @@ from pathspace_graph.convert.messages import (
     BROKEN,
     MessageError,
     cone_points,
-    frame_of,
+    frame_id_of,
     points_of,
     stamp_of,
     twist_of,
@@ -91,7 +91,7 @@ def test_markers_are_points_lists_or_neither(messages: Messages) -> None:
     np.testing.assert_allclose(found.points, [[5.0, 1.5], [10.0, 1.0], [9.0, 0.0]], atol=1e-12)
     assert found.labels.tolist() == [LEFT, RIGHT, ORANGE]
     assert stamp_of(array) == EPOCH + 2.0
-    assert frame_of(array) == "base_link"
+    assert frame_id_of(array) == "base_link"
     assert stamp_of(messages.markers([])) is None
     assert len(points_of(messages.markers([]), RULE).labels) == 0
 
