@@ -3,7 +3,7 @@
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -26,7 +26,6 @@ from .track import Track
 MIN_CONES: Final = 3  # least number of cones of a boundary
 REPEAT_DISTANCE: Final = 0.01  # distance below which a cone of an ordered row is the one before again (m)
 ORANGE: Final = "orange"  # part of PacSim's classes of cones of no boundary
-INVISIBLE: Final = "invisible"  # PacSim's class of cones that are not detected
 WIDTH_STEP: Final = 0.5  # distance of samples of a circuit (m)
 TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # centre line and widths
 EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
@@ -143,18 +142,13 @@ def _pacsim(path: Path, content: Any) -> Track:
     points = _points([cone.position for cones in lists for cone in cones])
     kinds = np.array([str(cone.kind) for cones in lists for cone in cones], str)
     row = np.repeat(np.arange(3), [*map(len, lists)])  # of which list: of no boundary, left or right
-    orange, hidden = np.char.find(kinds, ORANGE) >= 0, (kinds == INVISIBLE) & (row > 0)
+    orange = np.char.find(kinds, ORANGE) >= 0
     labels = np.where(np.char.find(kinds, "big") >= 0, BIG_ORANGE, SMALL_ORANGE)
     labels = np.where(orange, labels, UNKNOWN)
     left, right = (_without_repeats(points[(row == k) & ~orange], data.closed) for k in (1, 2))
     start = np.array([*data.start.position[:2], data.start.orientation[2]])
     no_boundary = orange | (row == 0)
-    track = Track(left, right, points[no_boundary], data.closed, start, path.stem, labels[no_boundary])
-    if not hidden.any():
-        return track
-    seen = (cones[~(cones[:, None] == points[hidden]).all(axis=2).any(axis=1)] for cones in (left, right))
-    s = np.arange(0.0, track.centre_line.length, WIDTH_STEP)
-    return replace(track, **dict(zip(("left", "right"), seen, strict=True)), path=track.centre_line.points(s))
+    return Track(left, right, points[no_boundary], data.closed, start, path.stem, labels[no_boundary])
 
 
 def _fssim(path: Path, content: Any) -> Track:
