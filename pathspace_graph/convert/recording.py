@@ -2,22 +2,25 @@
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
+import gtsam
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import rotation
+from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.covariances import is_positive_definite, ray_covariances
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_STAMP
 from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.settings.online import LimitSettings
 
-from . import twists
 from .lines import from_sensor, lines_of
 from .messages import ALONE, Points
 from .settings import Frames, NoiseSettings, Window
@@ -51,7 +54,7 @@ class Recording:
     @property
     def parts(self) -> int:
         """Number of parts of the interval of two twists that are interpolated; 1 for none."""
-        return 1 if self.are_poses or self.is_held else twists.parts_of(self.t)
+        return 1 if self.are_poses or self.is_held else parts_of(self.t)
 
     @property
     def numbers(self) -> IntArray:
@@ -101,7 +104,7 @@ def strays(t: Array) -> BoolArray:
         return np.zeros(len(t), bool)
     before, after = np.append(t[1], t[:-1]), np.append(t[1:], t[-2])
     before[0], after[-1] = t[2], t[-3]
-    far = twists.LIMITS.silence
+    far = LIMITS.silence
     apart = np.minimum(np.abs(t - before), np.abs(t - after))
     return np.asarray((apart > far) & (np.abs(before - after) <= far))
 
@@ -140,8 +143,7 @@ def to_log(
     """Convert a record to a log; InputError of `file` if nothing is usable.
 
     Points are of lines where a spacing (m) is stated, or none stands alone; they are so far apart, by default
-    a share of their median range. Polylines beside points
-    that stand alone are dropped, and so is what was reported twice.
+    a share of their median range. Else polylines are dropped, and so is what was reported twice.
     """
     frames, notes = replace(frames, mounting=frames.mounting or record.mounting), record.notes
     odometry = _odometry(record, frames, file)
@@ -168,6 +170,17 @@ def to_log(
 
 
 # --- odometry ----------------------------------------------------------------------------------------------
+
+LIMITS: Final = LimitSettings()  # beyond which no estimator uses a twist
+ACCELERATIONS: Final = np.array([20.0, 20.0, 15.0])  # that no vehicle exceeds (m/s^2, m/s^2, rad/s^2)
+AROUND: Final = 5  # number of rows before a row, and after it, whose medians it is compared with
+MAD: Final = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
+WRAP_SHARE: Final = 0.7  # share of half a turn in a row that marks a yaw that was differenced where it wraps
+MOST_WRONG: Final = 0.05  # largest share of rows that are mistakes of single rows
+FEW: Final = 6  # number of rows that jump that are mistakes in any record
+FROZEN: Final = 1.2  # longest time (s) for which a repeated pose is one that was not measured anew
+PERIOD: Final = 0.05  # longest part (s) of an interval that is interpolated
+GAP: Final = 2.5  # a longer interval, in median ones, is a gap, over which nothing is interpolated
 
 
 def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
@@ -197,20 +210,20 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
         if len(rows) < 2:
             raise InputError(file, f"expected two poses at least, found {len(rows)}")
         rows = keep(
-            twists.measured_anew(rows[:, 1], rows[:, 2:]),
+            measured_anew(rows[:, 1], rows[:, 2:]),
             "odometry samples repeat the pose before them, and were left out",
         )
         notes["odometry samples are differences of poses, whose noise is not white"] += len(rows) - 1
-        moved = twists.twists_between(rows[:, 1], rows[:, 2:])
+        moved = twists_between(rows[:, 1], rows[:, 2:])
         rows = np.column_stack([rows[:-1, :2], moved])
     rows = rows[_possible(record, rows, file)]
-    odometry = twists.interpolated(rows[:, 1], rows[:, 2:], record.parts)
+    odometry = interpolated(rows[:, 1], rows[:, 2:], record.parts)
     if record.parts > 1:
         slow = rate(len(rows), float(np.ptp(rows[:, 1])))
         told = f"odometry samples at {slow} were interpolated, {record.parts} for one"
         notes[f"{told} (--held takes each as in force until the next)"] += len(rows)
     if record.imu is not None:
-        odometry = Odometry(*twists.with_yaw_rate(odometry.t, odometry.twist, *record.imu))
+        odometry = Odometry(*with_yaw_rate(odometry.t, odometry.twist, *record.imu))
         _check_stamps(odometry.t, "odometry", file, notes)
     return Odometry(odometry.t, odometry.twist * frames.flip)
 
@@ -221,7 +234,7 @@ def _possible(record: Recording, rows: Array, file: Path) -> BoolArray:
     What is left out is a gap: the twist before it is held, and estimators doubt it the longer the more.
     """
     numbers, t, values = rows[:, 0].astype(int), rows[:, 1], rows[:, 2:]
-    beyond, off = twists.beyond_limits(values), twists.jumps(t, values)
+    beyond, off = beyond_limits(values), jumps(t, values)
     notes = record.notes
 
     def told(row: int, column: int) -> str:
@@ -229,22 +242,22 @@ def _possible(record: Recording, rows: Array, file: Path) -> BoolArray:
         return f"{name} = {values[row, column]:.4g} {unit}"
 
     wrong, jumped = beyond.any(axis=1), (off != 0.0).any(axis=1)
-    if wrong.mean() > twists.MOST_WRONG:
+    if wrong.mean() > MOST_WRONG:
         first, column = np.argwhere(beyond)[0].tolist()
-        most = twists.LIMITS
+        most = LIMITS
         limits = f"speeds of at most {most.speed:g} m/s and yaw rates of {most.yaw_rate:g} rad/s"
         where = f"at first {told(first, column)} in {record.at(numbers[first : first + 1])}"
         found = f"found {wrong.sum()} of {len(t)} beyond, {where}"
         raise InputError(file, f"expected {limits}, {found}")
-    if jumped.sum() <= max(twists.MOST_WRONG * len(t), twists.FEW):  # else it is how this odometry is
+    if jumped.sum() <= max(MOST_WRONG * len(t), FEW):  # else it is how this odometry is
         wrong = wrong | jumped
     if wrong.any():
         first = int(np.argmax(wrong))
-        size = beyond[first] if beyond[first].any() else np.abs(off[first]) / twists.ACCELERATIONS
+        size = beyond[first] if beyond[first].any() else np.abs(off[first]) / ACCELERATIONS
         column = int(np.argmax(size))
         cause = "a position jumps" if column < 2 else "a value jumps"
         turn = abs(off[first, 2]) * float(np.median(np.diff(t))) / np.pi
-        if column == 2 and min(abs(turn - 1.0), abs(turn - 2.0)) < 1.0 - twists.WRAP_SHARE:
+        if column == 2 and min(abs(turn - 1.0), abs(turn - 2.0)) < 1.0 - WRAP_SHARE:
             cause = "the yaw was differenced where it wraps by a whole turn"
         where = f"{told(first, column)}, where {cause}, in {record.at(numbers[wrong])}"
         notes[f"odometry samples can't be, and were left out as a gap: {where}"] += int(wrong.sum())
@@ -261,6 +274,107 @@ def _check_stamps(t: Array, what: str, file: Path, notes: Counter[str]) -> None:
 
 def _why(notes: Counter[str], what: str = "detections") -> list[str]:
     return [f"{number} {text}" for text, number in notes.items() if number and what in text]
+
+
+def twists_between(t: Array, poses: Array) -> Array:
+    """Constant twists (n - 1, 3) that lead from each pose (n, 3) at t (n,) in s to the next."""
+    moves = [relative(one, other) for one, other in pairwise(poses)]
+    logarithms = np.array([gtsam.Pose2.Logmap(gtsam.Pose2(*move)) for move in moves]).reshape(-1, 3)
+    return logarithms / np.diff(t)[:, None]
+
+
+def measured_anew(t: Array, poses: Array) -> BoolArray:
+    """Which poses (n, 3) at t (n,) in s differ from the one before, or stay for longer than `FROZEN`.
+
+    A slow receiver's pose is often repeated at the rate of a faster sensor: differences would be 0, 0, 5 v.
+    """
+    new = np.append(True, (np.diff(poses, axis=0) != 0.0).any(axis=1))
+    since = t - t[np.maximum.accumulate(np.where(new, np.arange(len(t)), 0))]
+    return np.asarray(new | (since > FROZEN))
+
+
+def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[Array, Array]:
+    """Replace the yaw rate of twists at t (n,) in s, in order, by the mean of an IMU until the next twist."""
+    turn = np.argsort(imu_t, kind="stable")
+    turn = turn[np.isfinite(rates[turn])]
+    imu_t, rates = imu_t[turn], rates[turn]
+    inside = (t >= imu_t[0]) & (t <= imu_t[-1]) if len(imu_t) else np.zeros(len(t), bool)
+    t, twists = t[inside], twists[inside]
+    if len(t) < 2:
+        return t, twists
+    heading = np.append(0.0, np.cumsum(rates[:-1] * np.diff(imu_t)))
+    steps, turned = np.diff(t), np.diff(np.interp(t, imu_t, heading))
+    last = rates[np.searchsorted(imu_t, t[-1], side="right") - 1]
+    mean = np.interp(t[:-1], imu_t, rates)  # where no time passes
+    np.divide(turned, steps, out=mean, where=steps > 0)
+    twists[:, 2] = np.append(mean, last)
+    return t, twists
+
+
+def beyond_limits(twists: Array) -> BoolArray:
+    """Which entries of twists (n, 3) are beyond what an estimator uses."""
+    return np.asarray(np.abs(twists) > [LIMITS.speed, LIMITS.speed, LIMITS.yaw_rate])
+
+
+def jumps(t: Array, twists: Array) -> Array:
+    """How far single rows of twists (n, 3) at t (n,) in s jump, and 0 for the others (n, 3).
+
+    A row x jumps if it lies outside the medians a and b of the rows before and after it by more than a
+    vehicle accelerates meanwhile, and more than the rows' noise:
+
+        max(x - max(a, b), min(a, b) - x) > AROUND A dt / 2 + 6 sigma
+
+    Up to two rows in turn can jump. A yaw rate may leave the medians by less than a share of pi / dt: one
+    that was differenced where the yaw wraps leaves them by 2 pi / dt, or in two rows by pi / dt.
+    """
+    if len(t) <= 2 * AROUND:
+        return np.zeros(twists.shape)
+    steps = np.diff(t)
+    dt = float(np.median(steps))
+    apart = np.maximum(np.maximum(np.append(dt, steps), np.append(steps, dt)), dt)  # more beside a gap
+    rows = np.pad(twists, ((AROUND, AROUND), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(rows, AROUND, axis=0)
+    before, after = np.median(windows[: len(t)], axis=-1), np.median(windows[AROUND + 1 :], axis=-1)
+    low, high = np.minimum(before, after), np.maximum(before, after)
+    off = twists - np.clip(twists, low, high)
+    middle = 0.5 * (twists[:-2] + twists[2:])
+    sigma = MAD * np.median(np.abs(twists[1:-1] - middle), axis=0) / np.sqrt(1.5)
+    most = 0.5 * AROUND * ACCELERATIONS * apart[:, None] + 6.0 * sigma
+    most[:, 2] = np.where(apart < 1.5 * dt, np.minimum(most[:, 2], WRAP_SHARE * np.pi / dt), most[:, 2])
+    return np.where(np.abs(off) > most, off, 0.0)
+
+
+def parts_of(t: Array) -> int:
+    """Number of parts of an interval of sampled twists at t (n,) in s, each `PERIOD` long at most.
+
+    It is 1 for periods up to 0.12 s, which can be held, and for too few samples to know their period.
+    """
+    steps = np.diff(np.unique(t[np.isfinite(t)]))
+    period = float(np.median(steps)) if len(steps) >= 20 else 0.0
+    return int(np.ceil(period / PERIOD - 1e-6)) if period > 0.12 else 1
+
+
+def interpolated(t: Array, twists: Array, parts: int) -> Odometry:
+    """Interpolate sampled twists (n, 3) at t (n,) in s: the mean of each of the parts of an interval.
+
+    A log holds each twist until the next one, so that a slow one would lag by half its period. Cubic splines
+    go through the samples between gaps, where the last twist is held.
+    """
+    if parts == 1 or len(t) < 2:
+        return Odometry(t, twists)
+    steps = np.diff(t)
+    ends = np.flatnonzero(steps > GAP * np.median(steps)) + 1
+    stamps, values = [], []
+    for run in np.split(np.arange(len(t)), ends):
+        at, own = t[run], twists[run]
+        if len(run) > 1:
+            begins = (at[:-1, None] + np.diff(at)[:, None] * (np.arange(parts) / parts)).ravel()
+            whole = CubicSpline(at, own).antiderivative()(np.append(begins, at[-1]))
+            stamps.append(begins)
+            values.append(np.diff(whole, axis=0) / np.diff(np.append(begins, at[-1]))[:, None])
+        stamps.append(at[-1:])
+        values.append(own[-1:])
+    return Odometry(np.concatenate(stamps), np.concatenate(values))
 
 
 # --- detections --------------------------------------------------------------------------------------------

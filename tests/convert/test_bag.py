@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pathspace_graph.cli import main
-from pathspace_graph.convert.twists import with_yaw_rate
+from pathspace_graph.convert.recording import with_yaw_rate
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.io.log_files import read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN

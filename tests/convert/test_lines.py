@@ -20,7 +20,7 @@ from pathspace_graph.estimators import make_online
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.io.log_files import read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.ros.stream import MessageStream
+from pathspace_graph.ros.node import MessageStream
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import sampled
