@@ -308,12 +308,6 @@ def test_a_wrong_row_of_a_file_without_a_header_has_its_number(tmp_path: Path) -
         read_track(file)
 
 
-def test_missing_file(tmp_path: Path) -> None:
-    for name in ("t.csv", "t.yaml", "t.txt"):
-        with pytest.raises(InputError, match="found none"):
-            read_track(tmp_path / name)
-
-
 def test_tum_circle(tmp_path: Path) -> None:
     angles = np.arange(60) * 2 * np.pi / 60
     rows = "".join(f"{50 * np.cos(a)},{50 * np.sin(a)},4,6\n" for a in angles)
