@@ -27,7 +27,7 @@ from .messages import (
     twist_of,
     yaw_rate_of,
 )
-from .recording import Recording, check_clock, rate
+from .recording import Recording, check_clock, chosen_motion, rate
 from .settings import BagOptions, LabelRule
 
 SUPPORTED: Final = {  # contents that a message must have, by the option of its topic
@@ -85,7 +85,19 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
         notes[told] += len(namespaces)
     if imu is not None:
         check_clock(imu.t, "the IMU", path)
-    moved, are_poses = _motion(odometry, imu is not None, options, path)
+    twists, poses = (
+        np.array([one for one in of if one is not None])
+        for of in zip(*((motion.twist, motion.pose) for motion in odometry.values), strict=True)
+    )
+    moved, are_poses = chosen_motion(
+        twists if len(twists) else None,
+        poses if len(poses) == len(odometry.values) else None,
+        *(odometry.name, path),
+        from_poses=options.from_poses,
+    )
+    if imu is None and not are_poses and np.isnan(moved[:, 2]).all():
+        expected = "expected --imu TOPIC for the yaw rate, or --wheelbase where there is a steering angle"
+        raise InputError(path, f"{odometry.name}: {expected}, found neither")
     mounting = None if mounted else _mounting(odometry, detections, static, notes, path)
     source = {"bag": path.name, "odometry": odometry.name, "detections": detections.name}
     source |= {} if imu is None else {"imu": imu.name}
@@ -103,25 +115,6 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
         rows=odometry.numbers,
         place=f"{options.odometry}, message",
     )
-
-
-def _motion(odometry: Samples, has_imu: bool, options: BagOptions, path: Path) -> tuple[Array, bool]:
-    """Twists (N, 3) of the vehicle, with NaN for what an IMU gives, or its poses; and which of both."""
-    measured = [motion.twist for motion in odometry.values if motion.twist is not None]
-    poses = np.array([motion.pose for motion in odometry.values if motion.pose is not None])
-    whole = len(poses) == len(odometry.values)
-    if options.from_poses or not measured:
-        if not whole:
-            raise InputError(path, f"--from-poses: expected messages with a pose, found {odometry.name}")
-        return poses, True
-    twists = np.array(measured)
-    if whole and not twists.any() and np.ptp(poses, axis=0).any():
-        found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
-        raise InputError(path, f"{odometry.name}: expected twists, {found}")
-    if not has_imu and np.isnan(twists[:, 2]).all():
-        expected = "expected --imu TOPIC for the yaw rate, or --wheelbase where there is a steering angle"
-        raise InputError(path, f"{odometry.name}: {expected}, found neither")
-    return twists, False
 
 
 # --- where the sensor is ---------------------------------------------------------------------------------

@@ -74,6 +74,20 @@ class Recording:
         return f"{self.place} {told}{', ...' * (len(rows) > MOST_PLACES)}"
 
 
+def chosen_motion(
+    twists: Array | None, poses: Array | None, name: str, file: Path, *, from_poses: bool
+) -> tuple[Array, bool]:
+    """Twists (N, 3), or poses (N, 3) where there are none or `from_poses` is stated; and which of both."""
+    if from_poses or twists is None:
+        if poses is None:
+            raise InputError(file, f"--from-poses: expected poses, found {name}")
+        return poses, True
+    if poses is not None and not np.nan_to_num(twists).any() and np.ptp(poses, axis=0).any():
+        found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
+        raise InputError(file, f"{name}: expected twists, {found}")
+    return twists, False
+
+
 def rate(count: int, seconds: float) -> str:
     """Rate of something in words, unknown where no time (s) passed."""
     return f"{count / seconds:.3g} Hz" if count > 1 and seconds > 1e-6 else "an unknown rate"

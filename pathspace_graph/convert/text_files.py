@@ -18,7 +18,7 @@ from pathspace_graph.io.tables import DELIMITERS, TUM, read_table, read_trajecto
 from pathspace_graph.labels import UNKNOWN
 
 from .messages import ALONE, BROKEN, Points, cone_points, scan_points, yaw_of
-from .recording import Recording
+from .recording import Recording, chosen_motion
 from .settings import LabelRule
 
 ODOMETRY: Final = "odometry"
@@ -123,6 +123,10 @@ class _Columns:
     def __contains__(self, key: str) -> bool:
         return key in self.named
 
+    def has(self, *keys: str) -> bool:
+        """Whether the file has all of these, also by a name that was stated for the other file."""
+        return all(self.named.get(key, "").removeprefix("-") in self.table.columns for key in keys)
+
     def require(self, *keys: str, otherwise: str = "") -> None:
         """Raise an InputError where a quantity is not in the file."""
         for key in keys:
@@ -161,21 +165,20 @@ class _Columns:
 
 def _motion(file: _Columns, *, from_poses: bool) -> tuple[Array, bool]:
     """Twists (rows, 3) or poses (rows, 3) of the odometry, with NaN where they are missing; and which."""
-    has_turn = all(key in file for key in QUATERNION)
-    has_poses = "x" in file and "y" in file and ("yaw" in file or has_turn)
-    if from_poses and not has_poses:
+    twists, poses = None, None
+    if file.has("x", "y", "yaw"):
+        poses = np.column_stack([file[key] for key in ("x", "y", "yaw")])
+    elif file.has("x", "y", *QUATERNION):
+        turn = SimpleNamespace(**{key[1]: file[key] for key in QUATERNION})
+        poses = np.column_stack([file["x"], file["y"], yaw_of(turn)])
+    elif from_poses:
         file.require("x", "y", "yaw", otherwise=" for --from-poses")
-    if has_poses and (from_poses or not ("vx" in file and "wz" in file)):
-        turn = SimpleNamespace(**{key[1]: file[key] for key in QUATERNION if has_turn})
-        heading = file["yaw"] if "yaw" in file else yaw_of(turn)
-        return np.column_stack([file["x"], file["y"], heading]), True
-    file.require("vx", "wz", otherwise=", or a pose x, y, yaw")
-    vx, wz = file["vx"], file["wz"]
-    twists = np.column_stack([vx, file["vy"] if "vy" in file else np.zeros(len(vx)), wz])
-    if has_poses and not np.nan_to_num(twists).any() and np.ptp(file["x"]) > 0.0:
-        found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
-        raise InputError(file.table.file, f"expected twists, {found}")
-    return twists, False
+    else:
+        file.require("vx", "wz", otherwise=", or a pose x, y, yaw")
+    if "vx" in file and "wz" in file:
+        vy = file["vy"] if "vy" in file else np.zeros(len(file.table))
+        twists = np.column_stack([file["vx"], vy, file["wz"]])
+    return chosen_motion(twists, poses, "the odometry", file.table.file, from_poses=from_poses)
 
 
 def _scans(file: _Columns, rule: LabelRule) -> tuple[Array, Points]:
