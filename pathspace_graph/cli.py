@@ -39,22 +39,22 @@ class Entry(NamedTuple):
 
 GROUPS: Final = {
     "Maps": {
-        "demo": Entry("map:Demo", "compare", "Map a generated track online: a table, a map, its picture."),
-        "online": Entry("map:Online", "estimate", "Map a log online, cycle by cycle."),
-        "batch": Entry("map:Batch", "estimate", "Optimize whole logs at once, as the ground reference."),
-        "plot": Entry("map:Plot", "plot", "Draw a map with its uncertainty band."),
-        "export": Entry("map:Export", "export", "Write a map as planners and other tools read it."),
+        "demo": Entry("runs:Demo", "compare", "Map a generated track online: a table, a map, its picture."),
+        "online": Entry("runs:Online", "estimate", "Map a log online, cycle by cycle."),
+        "batch": Entry("runs:Batch", "estimate", "Optimize whole logs at once, as the ground reference."),
+        "plot": Entry("runs:Plot", "plot", "Draw a map with its uncertainty band."),
+        "export": Entry("runs:Export", "export", "Write a map as planners and other tools read it."),
     },
     "Data": {
         "simulate": Entry("data:Simulate", "simulate", "Write the log of a simulated drive, with truth."),
         "convert": Entry("data:Convert", "convert", "Write a ROS bag, CSV files or JSON lines as a log."),
     },
     "Studies": {
-        "compare": Entry("study:Compare", "compare", "Run every estimator on logs: the paper's table."),
-        "ablate": Entry("study:Ablate", "studies", "Run a study of estimators and settings."),
-        "faults": Entry("study:FaultSuite", "studies", "Measure what each fault of a car costs."),
-        "scale": Entry("study:Scale", "studies", "Measure update time against map size."),
-        "report": Entry("study:Report", "studies", "Measure the figures of the pages."),
+        "compare": Entry("runs:Compare", "compare", "Run every estimator on logs: the paper's table."),
+        "ablate": Entry("runs:Ablate", "studies", "Run a study of estimators and settings."),
+        "faults": Entry("runs:FaultSuite", "studies", "Measure what each fault of a car costs."),
+        "scale": Entry("runs:Scale", "studies", "Measure update time against map size."),
+        "report": Entry("runs:Report", "studies", "Measure the figures of the pages."),
     },
 }
 EXTRAS: Final = {  # packages that the core does without, and the extra that has them

@@ -11,8 +11,15 @@ from numpy.random import Generator
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.sensor import SENSOR
-from pathspace_graph.io.covariances import SIGMA_DETECTIONS, ray_covariances
-from pathspace_graph.io.log import SIGMA_ODOMETRY, Detections, Log, SensorInfo, Truth
+from pathspace_graph.io.log import (
+    SIGMA_DETECTIONS,
+    SIGMA_ODOMETRY,
+    Detections,
+    Log,
+    SensorInfo,
+    Truth,
+    ray_covariances,
+)
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.labels import NAMES, UNKNOWN
 from pathspace_graph.lengths import scaled

@@ -18,7 +18,7 @@ EXTRAS = {"distributed", "rerun", "rosbags", "builtin_interfaces"} | ROS
 
 LATE = {
     "commands.estimate": {"eval.view.recording", "commands.plot"},
-    "options.map": {"io.overrides"},
+    "options.runs": {"io.overrides"},
     "io.brief": {"eval.figures.map_plot", "frames"},
 }
 """Modules that are imported by name when needed, since matplotlib is slow."""

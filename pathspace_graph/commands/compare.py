@@ -23,8 +23,7 @@ from pathspace_graph.io.files import atomic_folder, check_target, write_json
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import write_result
-from pathspace_graph.options.map import Demo
-from pathspace_graph.options.study import Compare
+from pathspace_graph.options.runs import Compare, Demo
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from .estimate import map_online, outline, tell

@@ -35,7 +35,7 @@ from pathspace_graph.io.results import BatchRun, RunResult, write_result
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.options.map import Batch, MapKind, Online, Plot
+from pathspace_graph.options.runs import Batch, MapKind, Online, Plot
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
 from pathspace_graph.plausibility.judge import Hint, objections, read_plausible_log
 from pathspace_graph.run import Observer, OnlineEstimator, run_online, with_own

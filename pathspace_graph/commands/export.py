@@ -15,7 +15,7 @@ from pathspace_graph.io.log_files import read_log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FILE, write_trajectory
 from pathspace_graph.io.tables import read_table, read_trajectory
-from pathspace_graph.options.map import Export
+from pathspace_graph.options.runs import Export
 from pathspace_graph.spline.ahead import LEAST_STEP, MOST_POINTS
 from pathspace_graph.spline.crossing import crossed_boundaries, crossings_told
 

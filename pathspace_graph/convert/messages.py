@@ -10,7 +10,7 @@ import numpy as np
 
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.io.covariances import covariances_of
+from pathspace_graph.io.log import covariances_of
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
 from .settings import LABEL_FIELDS, NO_LABEL, LabelRule

@@ -15,8 +15,14 @@ from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io import log as logs
-from pathspace_graph.io.covariances import is_positive_definite, ray_covariances
-from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
+from pathspace_graph.io.log import (
+    Detections,
+    Log,
+    Odometry,
+    SensorInfo,
+    is_positive_definite,
+    ray_covariances,
+)
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_STAMP
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.settings.online import LimitSettings

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.covariances import SIGMA_DETECTIONS
+from pathspace_graph.io.log import SIGMA_DETECTIONS
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.settings.checked import AT_LEAST_0, POSITIVE, AtLeast0, Checked, Signed, Unlimited
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.covariances import covariances_of
+from pathspace_graph.io.log import covariances_of
 from pathspace_graph.io.parsing import is_number, read_text, shown
 from pathspace_graph.io.tables import DELIMITERS, TUM, read_table, read_trajectory, read_tum
 from pathspace_graph.labels import UNKNOWN

@@ -11,7 +11,7 @@ from pathspace_graph.convert.settings import BagOptions, Frames, NoiseSettings, 
 from pathspace_graph.sim.simulate import PRESETS, SimulationSettings, preset
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings
 
-from .map import INLINE, FolderCommand
+from .runs import INLINE, FolderCommand
 
 
 @dataclass(frozen=True, kw_only=True)

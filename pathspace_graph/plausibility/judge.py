@@ -29,8 +29,7 @@ from pathspace_graph.front_end.measurement import LEAST_NOISE
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
 from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_UNKNOWN, TwistRecord
 from pathspace_graph.io import log as logs
-from pathspace_graph.io.covariances import covariances_of
-from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, covariances_of
 from pathspace_graph.io.log_files import read_log
 from pathspace_graph.io.parsing import shown
 from pathspace_graph.io.tables import read_table

@@ -20,7 +20,7 @@ from pathspace_graph.convert.recording import (
 from pathspace_graph.convert.settings import Frames, NoiseSettings, Window
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.se2 import compose, se2_exp
-from pathspace_graph.io.covariances import ray_covariances
+from pathspace_graph.io.log import ray_covariances
 
 FILE = Path("drive")
 
