@@ -16,17 +16,8 @@ from pathspace_graph.errors import InputError, PathspaceError, SettingsError, in
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.parsing import read_text
 
-from .messages import (
-    MessageError,
-    Points,
-    added,
-    frame_id_of,
-    points_of,
-    pose_of,
-    stamp_of,
-    twist_of,
-    yaw_rate_of,
-)
+from . import messages
+from .messages import MessageError, Points
 from .recording import Recording, check_clock, chosen_motion, rate
 from .settings import BagOptions, LabelRule
 
@@ -63,16 +54,21 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
     notes, namespaces = Counter[str](), Counter[str]()
 
     def motion(message: Any) -> Motion:
-        twist = twist_of(message, options.wheelbase)
-        return Motion(twist, pose_of(message), frame_id_of(message), frame_id_of(message, "child_frame_id"))
+        twist = messages.twist_of(message, options.wheelbase)
+        return Motion(
+            twist,
+            messages.pose_of(message),
+            messages.frame_id_of(message),
+            messages.frame_id_of(message, "child_frame_id"),
+        )
 
     def points(message: Any) -> tuple[str, Points]:
-        namespaces.update(marker.ns for marker in added(getattr(message, "markers", ())))
-        return frame_id_of(message), points_of(message, rule, options.namespaces)
+        namespaces.update(marker.ns for marker in messages.added(getattr(message, "markers", ())))
+        return messages.frame_id_of(message), messages.points_of(message, rule, options.namespaces)
 
     with closing(Bag(path, options, notes)) as bag:
         odometry = bag.samples(options.odometry, "--odometry", motion)
-        imu = bag.samples(options.imu, "--imu", yaw_rate_of) if options.imu else None
+        imu = bag.samples(options.imu, "--imu", messages.yaw_rate_of) if options.imu else None
         detections = bag.samples(options.detections, "--detections", points)
         static = [] if mounted else bag.transforms()
     listed = ", ".join(f"'{name}' ({count} markers)" for name, count in sorted(namespaces.items()))
@@ -249,7 +245,7 @@ class Bag:
             try:
                 message = decode(data, kind)
                 values.append(take(message))
-                stamps.append(stamp_of(message))
+                stamps.append(messages.stamp_of(message))
             except MessageError as error:
                 told = f"{option} {connections[0].topic} ({kind}): {error}"
                 raise self._error(f"{told}; supported are messages with {SUPPORTED[option]}") from None

@@ -15,14 +15,7 @@ from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io import log as logs
-from pathspace_graph.io.log import (
-    Detections,
-    Log,
-    Odometry,
-    SensorInfo,
-    is_positive_definite,
-    ray_covariances,
-)
+from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_STAMP
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.settings.online import LimitSettings
@@ -512,7 +505,7 @@ def in_vehicle_frame(
     covariances = found.covariances * np.outer(frames.sides, frames.sides)
     known = positive_definite(covariances) & (not noise.replace_covariances)
     notes[ASSUMED] += int((~known).sum())
-    assumed = ray_covariances(found.points * frames.sides, noise.sigmas)
+    assumed = logs.ray_covariances(found.points * frames.sides, noise.sigmas)
     covariances = np.where(known[:, None, None], covariances, assumed)
     turn = rotation((frames.mounting or (0.0, 0.0, 0.0))[2])
     turned = turn @ covariances @ turn.T
@@ -524,7 +517,7 @@ def positive_definite(covariances: Array) -> BoolArray:
     """Which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
     xx, xy, yx, yy = covariances.reshape(-1, 4).T
     with np.errstate(over="ignore", invalid="ignore"):
-        good = np.isfinite(covariances).all(axis=(1, 2)) & is_positive_definite(xx, xy, yy)
+        good = np.isfinite(covariances).all(axis=(1, 2)) & logs.is_positive_definite(xx, xy, yy)
         good &= np.abs(xy - yx) <= 1e-3 * np.maximum(xx, yy)  # messages in single precision
         good &= np.maximum(xx, yy) < MAX_RANGE**2
     return np.asarray(good)

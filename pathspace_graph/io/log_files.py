@@ -16,24 +16,9 @@ from pathspace_graph.factors.odometry import CALIBRATION
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.labels import KINDS, NAMES
 
+from . import log as logs
 from .files import atomic_folder, write_table
-from .log import (
-    COLUMNS,
-    DETECTIONS_FILE,
-    LOG_FILE,
-    ODOMETRY_FILE,
-    TRUTH_ASSOCIATIONS_FILE,
-    TRUTH_CONES_FILE,
-    TRUTH_FILES,
-    TRUTH_POSES_FILE,
-    Log,
-    SensorInfo,
-    Truth,
-    cycles_in,
-    increasing_times,
-    labels_of,
-    odometry_of,
-)
+from .log import Log, SensorInfo, Truth
 from .parsing import MAX_HEADER_BYTES, MAX_NOISE, Table, parse_toml, read_text, shown, typed
 from .tables import read_table
 
@@ -121,15 +106,16 @@ def read_log(folder: Path | str) -> Log:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "expected a log folder, found " + ("a file" if folder.exists() else "none"))
-    file = folder / LOG_FILE
+    file = folder / logs.LOG_FILE
     content = parse_toml(read_text(file, most=MAX_HEADER_BYTES), file)
     if content.get("format") != FORMAT:
         raise InputError(file, f'expected format = "{FORMAT}", found {shown(content.get("format"))}')
     header = typed(content, Header, file)
-    odometry, table = odometry_of(_table(folder, ODOMETRY_FILE)), _table(folder, DETECTIONS_FILE)
+    odometry = logs.odometry_of(_table(folder, logs.ODOMETRY_FILE))
+    table = _table(folder, logs.DETECTIONS_FILE)
     return Log(
         odometry=odometry,
-        cycles=cycles_in(table, float(odometry.t[0]), float(odometry.t[-1])),
+        cycles=logs.cycles_in(table, float(odometry.t[0]), float(odometry.t[-1])),
         odometry_sigma=np.array(header.odometry.sigma),
         sensor=SensorInfo(**asdict(header.sensor)),
         source={key: str(value) for key, value in header.source.items()},
@@ -144,18 +130,18 @@ def read_log(folder: Path | str) -> Log:
 
 def _table(folder: Path, name: str) -> Table:
     """Read a table of a log; an unknown one of the truth has no rows."""
-    if name in TRUTH_FILES and not (folder / name).exists():
-        return Table.of_arrays(folder / name, COLUMNS[name], np.zeros((0, len(COLUMNS[name]))))
-    return read_table(folder / name, COLUMNS[name])
+    if name in logs.TRUTH_FILES and not (folder / name).exists():
+        return Table.of_arrays(folder / name, logs.COLUMNS[name], np.zeros((0, len(logs.COLUMNS[name]))))
+    return read_table(folder / name, logs.COLUMNS[name])
 
 
 def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) -> Truth | None:
-    known = [(folder / name).exists() for name in TRUTH_FILES]
+    known = [(folder / name).exists() for name in logs.TRUTH_FILES]
     if not errors and not any(known):
         return None
-    poses, cones, table = (_table(folder, name) for name in TRUTH_FILES)
-    t, placed, points = increasing_times(poses), poses.stack(("x", "y", "theta")), cones.stack(("x", "y"))
-    truth = Truth(t, placed, points, labels_of(cones), None, **errors)
+    poses, cones, table = (_table(folder, name) for name in logs.TRUTH_FILES)
+    t, points = logs.increasing_times(poses), cones.stack(("x", "y"))
+    truth = Truth(t, poses.stack(("x", "y", "theta")), points, logs.labels_of(cones), None, **errors)
     if not known[-1]:
         return truth
     if len(table) != detection_count:
@@ -208,10 +194,10 @@ def write_log(log: Log, folder: Path | str, *, check: bool = False, force: bool 
     cannot be read is an InputError instead.
     """
     check_type("log", log, Log)
-    with atomic_folder(folder, LOG_FILE, force=force) as target:
-        (target / LOG_FILE).write_text(_to_toml(log), encoding="utf-8", newline="\n")
+    with atomic_folder(folder, logs.LOG_FILE, force=force) as target:
+        (target / logs.LOG_FILE).write_text(_to_toml(log), encoding="utf-8", newline="\n")
         for name, values in _columns(log).items():
-            write_table(target / name, COLUMNS[name], *values)
+            write_table(target / name, logs.COLUMNS[name], *values)
         if check:
             read_log(target)
 
@@ -248,8 +234,8 @@ def _columns(log: Log) -> dict[str, tuple[Any, ...]]:
     cycles, truth = log.cycles, log.truth
     covariances = np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in cycles)])
     columns: dict[str, tuple[Any, ...]] = {
-        ODOMETRY_FILE: (log.odometry.t, log.odometry.twist),
-        DETECTIONS_FILE: (
+        logs.ODOMETRY_FILE: (log.odometry.t, log.odometry.twist),
+        logs.DETECTIONS_FILE: (
             [cycle.t for cycle in cycles for _ in cycle.labels],
             np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in cycles)]),
             [NAMES[label] for cycle in cycles for label in cycle.labels],
@@ -257,10 +243,10 @@ def _columns(log: Log) -> dict[str, tuple[Any, ...]]:
         ),
     }
     if truth is not None:
-        columns[TRUTH_POSES_FILE] = truth.pose_t, truth.poses
-        columns[TRUTH_CONES_FILE] = truth.cones, [NAMES[label] for label in truth.cone_labels]
+        columns[logs.TRUTH_POSES_FILE] = truth.pose_t, truth.poses
+        columns[logs.TRUTH_CONES_FILE] = truth.cones, [NAMES[label] for label in truth.cone_labels]
         if truth.associations is not None:
-            columns[TRUTH_ASSOCIATIONS_FILE] = (truth.associations,)
+            columns[logs.TRUTH_ASSOCIATIONS_FILE] = (truth.associations,)
     return columns
 
 

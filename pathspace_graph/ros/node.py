@@ -19,16 +19,8 @@ from typing import Any, Final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.convert import messages
 from pathspace_graph.convert.lines import along_lines, default_spacing
-from pathspace_graph.convert.messages import (
-    BROKEN,
-    DENSE,
-    frame_id_of,
-    points_of,
-    pose_of,
-    stamp_of,
-    twist_of,
-)
 from pathspace_graph.convert.recording import ASSUMED, beyond_limits, distinct, in_vehicle_frame, usable
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings
 from pathspace_graph.errors import PathspaceError, SettingsError
@@ -75,7 +67,7 @@ class MessageStream:
     def take_odometry(self, message: Any, received: float) -> bool:
         """Buffer the twist of a message that was received at this time (s); return whether it is usable."""
         try:
-            t, twist = stamp_of(message) or received, twist_of(message)
+            t, twist = messages.stamp_of(message) or received, messages.twist_of(message)
             if twist is None:
                 raise ValueError("odometry: expected a message with a twist, found a pose alone")
             twist = twist * self.frames.flip
@@ -85,7 +77,7 @@ class MessageStream:
                 raise ValueError("odometry: expected a speed and a yaw rate that a vehicle can have")
             self._twists.append((t, twist.tolist()))
             self._first = min(self._first, t)
-        except BROKEN as error:
+        except messages.BROKEN as error:
             self.refused[str(error)] += 1
             return False
         return True
@@ -93,18 +85,18 @@ class MessageStream:
     def take_detections(self, message: Any, received: float) -> Iterator[tuple[Odometry, Detections]]:
         """Yield the cycles that have waited for long enough, with the twists since the last in `use`."""
         try:
-            points = points_of(message, self.rule)
+            points = messages.points_of(message, self.rule)
             points = points.where(points.lines < 0)  # polylines beside cones are decoration
-            if (points.lines == DENSE).any():
+            if (points.lines == messages.DENSE).any():
                 points = usable(points, self.refused)
                 points = along_lines(points, default_spacing(points))
             else:
                 points = distinct(points, self.refused)
-            t = stamp_of(message) or received
+            t = messages.stamp_of(message) or received
             if not self._first <= t < np.inf:
                 raise ValueError("detections: expected a stamp not before that of the first odometry")
             cycle = in_vehicle_frame(t, points, self.frames, self.noise, self.refused)
-        except BROKEN as error:
+        except messages.BROKEN as error:
             self.refused[str(error)] += 1
             return
         self._newest = max(self._newest, t)
@@ -150,11 +142,11 @@ class Bridge:
         """Take a message with odometry, received at a time (s)."""
         if not self.stream.take_odometry(message, received):
             return
-        with suppress(*BROKEN):
-            pose, t = pose_of(message), stamp_of(message) or received
-            self.body = frame_id_of(message, "child_frame_id") or self.body
+        with suppress(*messages.BROKEN):
+            pose, t = messages.pose_of(message), messages.stamp_of(message) or received
+            self.body = messages.frame_id_of(message, "child_frame_id") or self.body
             if pose is not None and np.isfinite(pose).all():
-                self.frame = frame_id_of(message)
+                self.frame = messages.frame_id_of(message)
                 self._odometry.append((t, pose, self.stream.newest_twist))
 
     def update(self, message: Any, received: float) -> CycleResult | None:
