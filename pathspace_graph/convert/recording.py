@@ -49,6 +49,7 @@ class Recording:
     imu: tuple[Array, Array] | None = None  # stamps (s) and yaw rates (rad/s) (k,) of an IMU
     rows: IntArray | None = None  # (N,) number of each row of the odometry in its file, by default from 1
     place: str = "odometry, row"  # what is counted by it
+    units: str = ""  # option that states other units, where there is one
 
     @property
     def parts(self) -> int:
@@ -210,7 +211,8 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     rows = keep(
         np.asarray(np.isfinite(rows).all(axis=1)), "odometry samples that are not finite were left out"
     )
-    _check_stamps(rows[:, 1], "odometry", file, notes)
+    wrong = record.at(rows[np.abs(rows[:, 1]) > MAX_STAMP, 0].astype(int))
+    _check_stamps(rows[:, 1], "odometry", file, notes, f" in {wrong}")
     notes["odometry samples were out of order, and were sorted"] += int((np.diff(rows[:, 1]) < 0).sum())
     rows = rows[np.argsort(rows[:, 1], kind="stable")]
     last = np.diff(rows[:, 1], append=np.inf) > 0  # of samples with one stamp the last one counts
@@ -261,7 +263,7 @@ def _possible(record: Recording, rows: Array, file: Path) -> BoolArray:
         limits = f"speeds of at most {most.speed:g} m/s and yaw rates of {most.yaw_rate:g} rad/s"
         where = f"at first {told(first, column)} in {record.at(numbers[first : first + 1])}"
         found = f"found {wrong.sum()} of {len(t)} beyond, {where}"
-        raise InputError(file, f"expected {limits}, {found}")
+        raise InputError(file, f"expected {limits}, {found}{record.units and f' ({record.units})'}")
     if jumped.sum() <= max(MOST_WRONG * len(t), FEW):  # else it is how this odometry is
         wrong = wrong | jumped
     if wrong.any():
@@ -277,12 +279,14 @@ def _possible(record: Recording, rows: Array, file: Path) -> BoolArray:
     return np.asarray(~wrong)
 
 
-def _check_stamps(t: Array, what: str, file: Path, notes: Counter[str]) -> None:
+def _check_stamps(t: Array, what: str, file: Path, notes: Counter[str], where: str = "") -> None:
     if len(t) == 0:
         raise InputError(file, "; ".join([f"expected {what} with stamps, found none", *_why(notes, what)]))
     worst = float(np.abs(t).max())
     if worst > MAX_STAMP:
-        raise InputError(file, f"expected stamps of {what} in s, at most {MAX_STAMP:g}, found {worst:g}")
+        raise InputError(
+            file, f"expected stamps of {what} in s, at most {MAX_STAMP:g}, found {worst:g}{where}"
+        )
 
 
 def _why(notes: Counter[str], what: str = "detections") -> list[str]:
@@ -360,11 +364,12 @@ def jumps(t: Array, twists: Array) -> Array:
 def parts_of(t: Array) -> int:
     """Number of parts of an interval of sampled twists at t (n,) in s, each `PERIOD` long at most.
 
-    It is 1 for periods up to 0.12 s, which can be held, and for too few samples to know their period.
+    It is 1 for periods up to 0.12 s, which can be held, for those of another unit than s, and for too few
+    samples to know their period.
     """
     steps = np.diff(np.unique(t[np.isfinite(t)]))
     period = float(np.median(steps)) if len(steps) >= 20 else 0.0
-    return int(np.ceil(period / PERIOD - 1e-6)) if period > 0.12 else 1
+    return int(np.ceil(period / PERIOD - 1e-6)) if 0.12 < period < 5.0 else 1
 
 
 def interpolated(t: Array, twists: Array, parts: int) -> Odometry:

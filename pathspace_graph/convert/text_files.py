@@ -82,6 +82,7 @@ def read_csv(
         is_held=held,
         rows=rows,
         place=f"{odometry.name}, row",
+        units="--units states others, as speed=km/h yaw_rate=deg/s angle=deg",
     )
 
 
