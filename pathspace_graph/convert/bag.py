@@ -233,10 +233,10 @@ class Bag:
             return received, stamps, values
         store, kind = self._store(connections[0]), connections[0].msgtype
         decode = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
-        messages = self._reader.messages(connections)
+        found = self._reader.messages(connections)
         while True:
             try:
-                _, time, data = next(messages)
+                _, time, data = next(found)
             except StopIteration:
                 return received, stamps, values
             except Exception as error:
