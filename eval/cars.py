@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from pathspace_graph.batch.joint_mapper import join
+from pathspace_graph.batch.joint import join
 from pathspace_graph.batch.known_map import map_of_cones
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE, make_batch, make_online, settings_of

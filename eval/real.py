@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.batch.joint_mapper import join
+from pathspace_graph.batch.joint import join
 from pathspace_graph.errors import SolveError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, wrap_angle

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pathspace_graph import estimators
-from pathspace_graph.batch.joint_mapper import JointResult, solve_together
+from pathspace_graph.batch.joint import JointResult, solve_together
 from pathspace_graph.batch.known_map import map_of_cones
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.console import note, output, progress, say

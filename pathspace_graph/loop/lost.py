@@ -14,7 +14,7 @@ from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, path_lengths, wrap_angle
 from pathspace_graph.front_end.front_end import Reading
-from pathspace_graph.graph.changes import forget_poses
+from pathspace_graph.graph.smoother import forget_poses
 from pathspace_graph.health import DEGRADED, Health
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.detections import DetectionColumns

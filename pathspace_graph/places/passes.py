@@ -16,7 +16,7 @@ from pathspace_graph.factors.se2 import (
     to_vehicle,
     wrap_angle,
 )
-from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.path import HEADING
 from pathspace_graph.settings.mapper import MapperSettings

@@ -195,9 +195,13 @@ class Boundary:
         points that act only beyond the previous last cone are placed again, since the direction there was a
         guess.
         """
-        before = int(self.cone_parameters.searchsorted(self.confirmed_end - KNOT_ROUND_OFF))
-        from_u = float(self.cone_parameters[before - 1]) if before else self.confirmed_end
+        from_u = self.last_cone(self.confirmed_end)
         return self.extend(len(control_points), targets_u, from_u).place(control_points, targets)
+
+    def last_cone(self, end: float) -> float:
+        """Parameter (m) of the last cone before an end, or the end itself without one."""
+        before = int(self.cone_parameters.searchsorted(end - KNOT_ROUND_OFF))
+        return float(self.cone_parameters[before - 1]) if before else end
 
     def extend(self, old: int, targets_u: Array, from_u: float | None = None) -> Placement:
         """Extend a curve of `old` control points to targets at parameters (k,); return how to place them.

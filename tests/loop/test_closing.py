@@ -51,7 +51,7 @@ def open_lap(log: Log) -> FixedLagMapper:
     """The mapper some metres after its curves are met again, which it does not notice."""
     cycle = next(k for k, result in enumerate(mapped(log)[1]) if result.closed)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pathspace_graph.loop.returns.return_to_beginning", lambda *_: None)
+        patch.setattr("pathspace_graph.loop.open.return_to_beginning", lambda *_: None)
         mapper, results = map_log(replace(log, cycles=log.cycles[:cycle]))
     assert not results[-1].closed
     return mapper
