@@ -81,14 +81,13 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
         notes[told] += len(namespaces)
     if imu is not None:
         check_clock(imu.t, "the IMU", path)
-    twists, poses = (
-        np.array([one for one in of if one is not None])
-        for of in zip(*((motion.twist, motion.pose) for motion in odometry.values), strict=True)
-    )
+    twists = np.array([one.twist for one in odometry.values if one.twist is not None])
+    poses = np.array([one.pose for one in odometry.values if one.pose is not None])
     moved, are_poses = chosen_motion(
         twists if len(twists) else None,
         poses if len(poses) == len(odometry.values) else None,
-        *(odometry.name, path),
+        odometry.name,
+        path,
         from_poses=options.from_poses,
     )
     if imu is None and not are_poses and np.isnan(moved[:, 2]).all():

@@ -163,7 +163,8 @@ def gaps_and_reach(log: Log) -> list[Hint]:
     """Hints if the vehicle drives without detections at an end, or if most cycles have hardly any."""
     if not log.cycles:
         return []
-    t, speed, begin, end = log.odometry.t, _speeds(log), log.cycles[0].t, log.cycles[-1].t
+    t, speed = log.odometry.t, np.hypot(*log.odometry.twist[:, :2].T)
+    begin, end = log.cycles[0].t, log.cycles[-1].t
     driven = t[speed > 0.1 * speed.max()]  # else it stands
     early = driven.size and begin - driven[0] > WITHOUT_DETECTIONS
     late = driven.size and driven[-1] - end > WITHOUT_DETECTIONS
@@ -204,7 +205,8 @@ def possible_rows(log: Log) -> tuple[Log, list[Hint]]:
 
 
 def beyond_any_vehicle(log: Log) -> list[Hint]:
-    speed, rate = (np.quantile(one, 0.9) for one in (_speeds(log), np.abs(log.odometry.twist[:, 2])))
+    vx, vy, wz = log.odometry.twist.T
+    speed, rate = (np.quantile(one, 0.9) for one in (np.hypot(vx, vy), np.abs(wz)))
     found = [hint_of("too fast", speed=speed)] if speed > FASTEST[0] else []
     return found + ([hint_of("turns too fast", rate=rate)] if rate > FASTEST[1] else [])
 
@@ -243,10 +245,6 @@ def _points(log: Log) -> Complex:
 
 def _labels(log: Log) -> Array:
     return np.concatenate([np.zeros(0, int), *(cycle.labels for cycle in log.cycles)])
-
-
-def _speeds(log: Log) -> Array:
-    return np.asarray(np.hypot(*log.odometry.twist[:, :2].T))
 
 
 def _median(values: Array) -> float:
