@@ -254,8 +254,7 @@ def cone_points(message: Any, rule: LabelRule) -> Points:
     points, covariances = list[tuple[float, float]](), list[Array]()
     labels, numbers = list[int](), list[int]()
     for number, (name, one) in enumerate((name, one) for name, listed in lists.items() for one in listed):
-        vertices = _vertices(one)
-        found = [_position(one)] if vertices is None else vertices
+        found, is_polyline = _positions(one)
         label = next((label for word, label in LIST_NAMES.items() if word in name.lower()), None)
         if label is None:
             value = _label_value(one, rule.fields)
@@ -263,7 +262,7 @@ def cone_points(message: Any, rule: LabelRule) -> Points:
         points += found
         labels += [label] * len(found)
         covariances += [_covariance(one)] * len(found)
-        numbers += [ALONE if vertices is None else number] * len(found)
+        numbers += [number if is_polyline else ALONE] * len(found)
     return Points.of(points, labels, covariances, numbers)
 
 
@@ -285,23 +284,21 @@ def _path(cone: Any) -> Iterator[Any]:
         at = first_of(at, POSITIONS)
 
 
-def _vertices(line: Any) -> list[tuple[float, float]] | None:
-    """Vertices (m) of a polyline: arrays x and y, or a list of points. None of a single point."""
-    if np.ndim(getattr(line, "x", 0.0)) and np.ndim(getattr(line, "y", 0.0)):
-        return [(float(x), float(y)) for x, y in zip(line.x, line.y, strict=True)]
-    if any(map(_place, _path(line))):
-        return None
-    lists = [points for name, points in _lists(line).items() if name != "covariance"]
-    return [*map(_position, lists[0])] if lists else None
+def _positions(one: Any) -> tuple[list[tuple[float, float]], bool]:
+    """Position (m) of a cone, or those of the vertices of a polyline, and whether it is one.
 
-
-def _position(cone: Any) -> tuple[float, float]:
-    """Position of a cone (m), which may lie some fields deep, as in a pose with covariance."""
-    place = next(filter(None, map(_place, _path(cone))), None)
-    if place is None:
+    A position may lie some fields deep, as in a pose with covariance. In its place a polyline has arrays x and
+    y, or a list of points.
+    """
+    if np.ndim(getattr(one, "x", 0.0)) and np.ndim(getattr(one, "y", 0.0)):
+        return [(float(x), float(y)) for x, y in zip(one.x, one.y, strict=True)], True
+    if place := next(filter(None, map(_place, _path(one))), None):
+        return [place], False
+    lists = [vertices for name, vertices in _lists(one).items() if name != "covariance"]
+    if not lists:
         expected = f"x and y, range and bearing, or one of {', '.join(POSITIONS)}"
-        raise MessageError(f"expected a cone with the fields {expected}, found {_names(cone)}")
-    return place
+        raise MessageError(f"expected a cone with the fields {expected}, found {_names(one)}")
+    return [place for vertex in lists[0] for place in _positions(vertex)[0]], True
 
 
 def _place(at: Any) -> tuple[float, float] | None:
