@@ -18,7 +18,7 @@ from pathspace_graph.front_end.gate import check_usable
 from pathspace_graph.front_end.noise import measure_noise
 from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.files import check_target
-from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE, Log, Odometry
+from pathspace_graph.io.log import LOG_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
@@ -95,20 +95,10 @@ def _convert(options: Convert, source: Path, out: Path) -> None:
 
 
 def _read(options: Convert, source: Path, rule: LabelRule) -> Recording:
-    if options.kind == "jsonl":
-        return read_json_lines(source, rule, from_poses=options.topics.from_poses, held=options.topics.held)
     if options.kind == "csv":
-        topics = options.topics
-        files = topics.odometry or ODOMETRY_FILE, topics.detections or DETECTIONS_FILE
-        return read_csv(
-            source / files[0],
-            source / files[1],
-            rule,
-            options.columns,
-            options.units,
-            from_poses=topics.from_poses,
-            held=topics.held,
-        )
+        return read_csv(source, options.topics, rule, options.columns, options.units)
+    if options.kind == "jsonl":
+        return read_json_lines(source, options.topics, rule)
     return read_bag(source, options.topics, rule, mounted=options.frames.mounting is not None)
 
 

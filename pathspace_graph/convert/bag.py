@@ -19,7 +19,7 @@ from pathspace_graph.io.parsing import read_text
 from . import messages
 from .messages import MessageError, Points
 from .recording import Recording, check_clock, chosen_motion, rate
-from .settings import BagOptions, LabelRule
+from .settings import LabelRule, Topics
 
 SUPPORTED: Final = {  # contents that a message must have, by the option of its topic
     "--odometry": "a twist, a speed or a pose",
@@ -49,7 +49,7 @@ class Motion(NamedTuple):
     body: str  # frame of the twist
 
 
-def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool = False) -> Recording:
+def read_bag(path: Path, options: Topics, rule: LabelRule, *, mounted: bool = False) -> Recording:
     """Read the drive in the topics of a bag; `mounted` says that the sensor's pose was stated."""
     notes, namespaces = Counter[str](), Counter[str]()
 
@@ -166,7 +166,7 @@ def transform_between(static: list[Any], body: str, sensor: str) -> gtsam.Pose3 
 class Bag:
     """A bag as the package `rosbags` reads it, with InputErrors in place of its errors."""
 
-    def __init__(self, path: Path, options: BagOptions, notes: Counter[str]) -> None:
+    def __init__(self, path: Path, options: Topics, notes: Counter[str]) -> None:
         if not path.exists():
             raise InputError(path, "expected a bag, found none")
         try:

@@ -287,8 +287,8 @@ def _path(cone: Any) -> Iterator[Any]:
 def _positions(one: Any) -> tuple[list[tuple[float, float]], bool]:
     """Position (m) of a cone, or those of the vertices of a polyline, and whether it is one.
 
-    A position may lie some fields deep, as in a pose with covariance. In its place a polyline has arrays x and
-    y, or a list of points.
+    A position may lie some fields deep, as in a pose with covariance. A polyline has arrays x and y in its
+    place, or a list of points.
     """
     if np.ndim(getattr(one, "x", 0.0)) and np.ndim(getattr(one, "y", 0.0)):
         return [(float(x), float(y)) for x, y in zip(one.x, one.y, strict=True)], True

@@ -28,8 +28,8 @@ HUES: Final = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)} 
 
 
 @dataclass(frozen=True)
-class BagOptions:
-    """Which messages of a bag are read, and how."""
+class Topics:
+    """Which messages of a bag, or files, are read, and how."""
 
     odometry: str | None = None
     """Topic of the odometry in a bag: any message with a twist, with a speed (then --imu or --wheelbase gives

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.log import covariances_of
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, covariances_of
 from pathspace_graph.io.parsing import is_number, read_text, shown
 from pathspace_graph.io.tables import DELIMITERS, TUM, read_table, read_trajectory, read_tum
 from pathspace_graph.labels import UNKNOWN
 
 from .messages import ALONE, BROKEN, Points, cone_points, scan_points, yaw_of
 from .recording import Recording, chosen_motion
-from .settings import LabelRule
+from .settings import LabelRule, Topics
 
 ODOMETRY: Final = "odometry"
 DETECTIONS: Final = "detections"
@@ -47,22 +47,17 @@ LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are lar
 
 
 def read_csv(
-    odometry: Path,
-    detections: Path,
-    rule: LabelRule,
-    columns: Sequence[str] = (),
-    units: Sequence[str] = (),
-    *,
-    from_poses: bool = False,
-    held: bool = False,
+    folder: Path, topics: Topics, rule: LabelRule, columns: Sequence[str] = (), units: Sequence[str] = ()
 ) -> Recording:
     """Read the drive in two CSV files; an InputError names file, row and column.
 
     Quantities are in columns of their own names, unless `columns` says `vx=speed`, `y=-cone_y` or
     `odometry.t=stamp`, and in SI units, unless `units` says `length=mm angle=deg time=ns`. Stamps may be
     seconds and nanoseconds in two columns (`t=sec+nsec`). The odometry has twists, or where they are missing
-    or `from_poses` is stated poses, which may be a trajectory in the format of TUM.
+    or the topics say so poses, which may be a trajectory in the format of TUM.
     """
+    odometry = folder / (topics.odometry or ODOMETRY_FILE)
+    detections = folder / (topics.detections or DETECTIONS_FILE)
     used = _units(units)
     first = (line.split() for line in read_text(odometry).splitlines() if line.strip() and line[0] != "#")
     words = next(first, [])
@@ -70,7 +65,11 @@ def read_csv(
         (t, motion), are_poses, rows = read_trajectory(odometry), True, read_tum(odometry).rows
     else:
         file = _Columns(ODOMETRY, odometry, columns, used)
-        (motion, are_poses), t, rows = _motion(file, from_poses=from_poses), file.stamps(), file.table.rows
+        (motion, are_poses), t, rows = (
+            _motion(file, from_poses=topics.from_poses),
+            file.stamps(),
+            file.table.rows,
+        )
     scans = _scans(_Columns(DETECTIONS, detections, columns, used), rule)
     in_words = ", ".join(f"{quantity} in {unit}" for quantity, unit in sorted(used.items()))
     return Recording(
@@ -79,7 +78,7 @@ def read_csv(
         *scans,
         {"odometry": odometry.name, "detections": detections.name, "units": in_words},
         are_poses=are_poses,
-        is_held=held,
+        is_held=topics.held,
         rows=rows,
         place=f"{odometry.name}, row",
         units="--units states others, as speed=km/h yaw_rate=deg/s angle=deg",
@@ -206,14 +205,12 @@ def _scans(file: _Columns, rule: LabelRule) -> tuple[Array, Points]:
     return t[begins], detections._replace(message=np.cumsum(begins) - 1)
 
 
-def read_json_lines(
-    file: Path, rule: LabelRule, *, from_poses: bool = False, held: bool = False
-) -> Recording:
+def read_json_lines(file: Path, topics: Topics, rule: LabelRule) -> Recording:
     """Read the drive in a file of JSON lines, in SI units; an InputError names file and line.
 
     A line is `{"t": s, "twist": [vx, vy, wz]}` or `{"t": s, "detections": [{"x": m, "y": m, "label": "blue",
     "covariance": [[xx, xy], [xy, yy]]}, ...]}`, or both. Label and covariance are optional, and `range` and
-    `bearing` may replace `x` and `y`. Where there is no twist, or `from_poses` is stated, the motion is that
+    `bearing` may replace `x` and `y`. Where there is no twist, or the topics say so, the motion is that
     of `"pose": [x, y, yaw]`. Instead of detections a line may have
     `"polylines": [{"points": [[x, y], ...], "label": "left"}, ...]` or a scan as of a `LaserScan`:
     `"scan": {"angle_min": rad, "angle_increment": rad, "range_min": m, "range_max": m, "ranges": [m, ...]}`.
@@ -236,8 +233,8 @@ def read_json_lines(
             raise InputError(file, f"{expected}, {told}", row) from None
         scan_t += [stamp] * len(points)
         scans += points
-    are_poses = bool(from_poses or (moved["pose"] and not moved["twist"]))
-    if from_poses and not moved["pose"]:
+    are_poses = bool(topics.from_poses or (moved["pose"] and not moved["twist"]))
+    if topics.from_poses and not moved["pose"]:
         raise InputError(file, "--from-poses: expected lines with pose [x, y, yaw], found none")
     entries = moved["pose" if are_poses else "twist"]
     return Recording(
@@ -247,7 +244,7 @@ def read_json_lines(
         Points.joined(scans),
         {"file": file.name},
         are_poses=are_poses,
-        is_held=held,
+        is_held=topics.held,
         rows=np.array([row for row, _, _ in entries], int),
         place=f"{file.name}, line",
     )
