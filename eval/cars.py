@@ -25,10 +25,9 @@ from pathspace_graph.sim.track_generator import generate_track
 from .experiment.statistics import estimate
 from .experiment.tables import Table
 from .metrics.accuracy import lap_metrics, root_mean_square
-from .metrics.alignment import shape_rmse
+from .metrics.alignment import motion_onto, shape_rmse
 from .metrics.consistency import consistency_at_cones, map_nees
 from .metrics.reference import truth_of
-from .metrics.registration import motion_onto
 from .metrics.trajectory import interpolate_poses, position_rms, trajectory_errors
 
 Columns = Mapping[str, tuple[str, int, float]]  # of a table, by their key: heading, digits, factor

@@ -26,9 +26,8 @@ from .experiment.statistics import estimate
 from .experiment.study import Study
 from .experiment.tables import Table
 from .metrics.accuracy import crossings
-from .metrics.alignment import aligned_distance, maps_apart
-from .metrics.metric import UNKNOWN, figure, figures
-from .metrics.registration import end_by_registration
+from .metrics.alignment import aligned_distance, end_by_registration, maps_apart
+from .metrics.measures import UNKNOWN, figure, figures
 
 RUNS: Final = {  # estimator of each run
     "online": registry.DEFAULT_ONLINE,

@@ -29,9 +29,14 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import SAMPLE, State
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import Boundary, boundaries_cross, sampled
+from pathspace_graph.spline.boundary import (
+    Boundary,
+    boundaries_cross,
+    crossed_boundaries,
+    crossings_told,
+    sampled,
+)
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.crossing import crossed_boundaries, crossings_told
 
 from .association import StationMatches
 from .optimizer import Convergence, Effort, Optimizer

@@ -13,7 +13,7 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.se2 import path_lengths, relative, rotated, to_map, wrap_angle
+from pathspace_graph.factors.se2 import difference, path_lengths, relative, rotated, to_map
 from pathspace_graph.front_end.front_end import JudgedLog
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import Elimination, linear_graph
@@ -232,8 +232,7 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
 
 def _is_off(revisit: Revisit, poses: Array) -> bool:
     """Whether poses (P, 3) contradict a revisit too much for the search of the next one."""
-    off = relative(poses[revisit.earlier], poses[revisit.later]) - revisit.local
-    off[2] = wrap_angle(off[2])
+    off = difference(relative(poses[revisit.earlier], poses[revisit.later]), revisit.local)
     return float(np.square(off / NEARBY[0]).sum()) > OFF**2
 
 

@@ -42,7 +42,7 @@ from pathspace_graph.run import Observer, OnlineEstimator, run_online, with_own
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import EVENTS
 from pathspace_graph.sim.track_files import read_track
-from pathspace_graph.spline.crossing import crossings_told
+from pathspace_graph.spline.boundary import crossings_told
 
 from .outcome import Outcome
 

@@ -10,7 +10,7 @@ from pathspace_graph.factors.odometry import CALIBRATION
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import LOST
 from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
-from pathspace_graph.spline.crossing import Crossing, crossed_boundaries
+from pathspace_graph.spline.boundary import Crossing, crossed_boundaries
 
 PRIOR_LIMIT: Final = 3.0  # prior standard deviations from zero beyond which a calibration is reported
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.periodic import make_periodic
+from pathspace_graph.baselines.filters import make_periodic
 from pathspace_graph.eval.metrics.accuracy import cone_distances
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
