@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
@@ -116,8 +115,7 @@ class ReckonedPath:
 
     @classmethod
     def of(cls, odometry: Odometry, step: float) -> "ReckonedPath":
-        moves = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
-        poses = np.vstack([np.zeros(3), moves])
+        poses = odometry.poses()
         s = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
         at = np.linspace(0.0, s[-1], int(min(np.ceil(s[-1] / step), 1_000_000)) + 1)
         moved = np.diff(s, prepend=-1.0) > 0.0

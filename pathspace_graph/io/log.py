@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
+from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.labels import NAMES, UNKNOWN, Kind, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
 
@@ -75,6 +76,10 @@ class Odometry(Brief):
         first = int(np.searchsorted(self.t, start, side="right")) - 1
         stop = max(first, int(np.searchsorted(self.t, end, side="left"))) if end > start else first
         return Odometry(np.maximum(self.t[first:stop], start), self.twist[first:stop])
+
+    def poses(self) -> Array:
+        """Poses (N, 3) at the stamps by dead reckoning, from the origin at the first."""
+        return np.vstack([np.zeros((1, 3)), integrate_poses(np.diff(self.t), self.twist[:-1])])
 
     def followed_by(self, later: Odometry) -> Odometry:
         """Append the later twists that are newer."""

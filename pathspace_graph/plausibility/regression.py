@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.factors.se2 import relative
 from pathspace_graph.front_end.scan_matching import (
     FARTHEST,
@@ -95,8 +94,7 @@ def motions_of(
 
 def dead_reckoned(odometry: Odometry, stamps: Array) -> Array:
     """Poses (n, 3) at stamps (n,) in s, by the odometry alone."""
-    poses = np.vstack([np.zeros((1, 3)), integrate_poses(np.diff(odometry.t), odometry.twist[:-1])])
-    return np.column_stack([np.interp(stamps, odometry.t, column) for column in poses.T])
+    return np.column_stack([np.interp(stamps, odometry.t, column) for column in odometry.poses().T])
 
 
 def _nearest(cycle: Detections) -> Detections:
