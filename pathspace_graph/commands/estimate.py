@@ -138,7 +138,7 @@ def check_online_options(options: Online) -> None:
 
 
 def own_parameters(options: Online | Batch) -> Any:
-    """Return the estimator's own parameters with those of the file; InputError where something is wrong."""
+    """Estimator's own parameters with those of the file; InputError where something is wrong."""
     try:
         parameters, rest = estimators.with_parameters(options.estimator, options.own([options.estimator]))
         override(options.settings, rest, "")

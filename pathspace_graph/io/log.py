@@ -258,7 +258,7 @@ class Log:
 
     @property
     def noise(self) -> KnownNoise:
-        """Return the noise as an estimator takes it, divided by the scale of the scene."""
+        """Noise as an estimator takes it, divided by the scale of the scene."""
         stated = self.odometry_stated, self.detections_stated
         scale, drift = self.sensor.sigma_range_scale, self.odometry_drift
         return scaled(KnownNoise(self.odometry_sigma, *stated, self.measured, scale, drift), 1.0 / self.scale)

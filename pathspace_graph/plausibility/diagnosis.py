@@ -32,14 +32,14 @@ def cause_of(name: str, value: float) -> str:
 
 
 def by_prior(state: VehicleState, settings: Mapping[str, Any]) -> dict[str, float]:
-    """Return calibrations in standard deviations of their priors, for those with a prior in the settings."""
+    """Calibrations in standard deviations of their priors, for those with a prior in the settings."""
     groups = {name: "odometry" if name in CALIBRATION else "calibration" for name in state.by_name}
     priors = {name: settings.get(group, {}).get(f"sigma_{name}") for name, group in groups.items()}
     return {name: state.by_name[name][0] / prior for name, prior in priors.items() if prior is not None}
 
 
 def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
-    """Return a line for each calibration beyond `PRIOR_LIMIT`, with its cause and whether it is certain."""
+    """Line for each calibration beyond `PRIOR_LIMIT`, with its cause and whether it is certain."""
     lines = []
     for name, ratio in by_prior(state, settings).items():
         value, sigma = map(float, state.by_name[name])
@@ -50,7 +50,7 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
 
 
 def crossings_of(result: RunResult) -> list[Crossing]:
-    """Return the places where the vehicle crossed the boundaries of its map, unless it was lost there."""
+    """Places where the vehicle crossed the boundaries of its map, unless it was lost there."""
     path = result.trajectory if result.smoothed is None else result.smoothed
     lost = np.array([record.health == LOST for record in result.cycles], bool)
     known = ~lost if len(lost) == len(path) else None
@@ -63,7 +63,7 @@ ERROR_WORTH: Final = {"yaw": 0.005, "lateral": 0.05, "latency": 0.01, "range_sca
 
 
 def noise_lines(noise: RunNoise | None) -> list[str]:
-    """Return a line on the measured noise, and another one if ranges and speeds disagree."""
+    """Line on the measured noise, and another one if ranges and speeds disagree."""
     if noise is None or noise.measured is None or "measured" not in (noise.odometry, noise.detections):
         return []
     lines = [measured_line(noise.measured)]
@@ -76,7 +76,7 @@ def noise_lines(noise: RunNoise | None) -> list[str]:
 
 
 def measured_line(measured: MeasuredNoise) -> str:
-    """Return a line on the noise, and on significant errors of the sensor."""
+    """Line on the noise, and on significant errors of the sensor."""
     forward, sideways, turning = (f"{sigma:.2g}" for sigma in measured.odometry)
     line = f"measured: odometry {forward} m/s, {sideways} m/s, {turning} rad/s from sample to sample"
     if measured.along is None or measured.across is None:

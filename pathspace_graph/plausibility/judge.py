@@ -73,13 +73,13 @@ def hint_of(mistake: str, **figures: Any) -> Hint:
 
 
 def because(hints: Sequence[Hint]) -> str:
-    """Return the likely causes of a refusal in words; empty without hints."""
+    """Likely causes of a refusal in words; empty without hints."""
     causes = [f"{hint.likely} ({hint.file}, {hint.columns}: {hint.found})" for hint in hints]
     return f"likely cause: {'; '.join(causes)}" if causes else ""
 
 
 def objections(hints: Sequence[Hint]) -> list[str]:
-    """Return why the map of a log with these hints is wrong; empty if all are `SURVIVABLE`."""
+    """Why the map of a log with these hints is wrong; empty if all are `SURVIVABLE`."""
     likely = [hint.likely for hint in hints if hint.cause not in SURVIVABLE]
     return [f"not a map of the drive: {'; '.join(likely)}"] if likely else []
 
@@ -130,7 +130,7 @@ FASTEST: Final = 100.0, 8.0  # speed (m/s) and yaw rate (rad/s) that no vehicle 
 
 
 def parts_of_stamps(log: Log) -> list[Hint]:
-    """Return a hint for each file whose stamps have only whole seconds, or only fractions of a second."""
+    """Hint for each file whose stamps have only whole seconds, or only fractions of a second."""
     found = []
     for file, t in _stamps(log).items():
         falls, seconds, fraction = int((np.diff(t) < 0.0).sum()), "whole seconds", "fraction of each second"
@@ -144,7 +144,7 @@ def parts_of_stamps(log: Log) -> list[Hint]:
 
 
 def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
-    """Return the log with stamps in seconds, and a hint for each file with another unit."""
+    """Log with stamps in seconds, and a hint for each file with another unit."""
     found, sizes = [], dict.fromkeys(_stamps(log), 1.0)
     for file, t in _stamps(log).items():
         step = _median(np.abs(np.diff(t)))
@@ -190,7 +190,7 @@ def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
 
 
 def possible_rows(log: Log) -> tuple[Log, list[Hint]]:
-    """Return the log without steps of the odometry that cannot be, and a hint about these rows."""
+    """Log without steps of the odometry that cannot be, and a hint about these rows."""
     twist = log.odometry.twist
     smooth = scipy.ndimage.median_filter(twist, size=(5, 1), mode="nearest")
     step = np.abs(twist - smooth)
@@ -228,7 +228,7 @@ def one_label(log: Log) -> list[Hint]:
 
 
 def sided(log: Log, turn: complex = 1.0, *, mirrored: bool = False) -> float:
-    """Return the share of near labels on their side, once a mirrored frame is turned; 0.5 without labels."""
+    """Share of near labels on their side, once a mirrored frame is turned; 0.5 without labels."""
     points, labels = _points(log), _labels(log)
     near = np.isin(labels, (LEFT, RIGHT)) & (np.abs(points) < _median(np.abs(points)))
     left = ((points.conj() if mirrored else points)[near] * turn).imag > 0.0
@@ -363,7 +363,7 @@ def tell_factors(told: Told, regression: Regression, fit: Fit) -> None:
 
 
 def unit_of(size: float, units: Mapping[float, str]) -> tuple[str, float]:
-    """Return name and size of the unit near a size, or of an unknown unit; without a name near 1."""
+    """Name and size of the unit near a size, or of an unknown unit; without a name near 1."""
     near = min(units, key=lambda one: abs(np.log(one / max(size, TINY))))
     if 1.0 / SAME_FACTOR < size / near < SAME_FACTOR:
         return units[near], near
@@ -606,7 +606,7 @@ def read_plausible_log(
 
 
 def refused_hints(folder: Path) -> list[Hint]:
-    """Return the hints about a refused log; none if it cannot be parsed."""
+    """Hints about a refused log; none if it cannot be parsed."""
     try:
         files = ODOMETRY_FILE, DETECTIONS_FILE
         rows, table = (read_table(folder / file, logs.COLUMNS[file]) for file in files)

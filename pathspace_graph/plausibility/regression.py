@@ -105,7 +105,7 @@ def _nearest(cycle: Detections) -> Detections:
 def register(
     before: Detections, after: Detections, starts: Sequence[Array], farthest: float, fewest: int
 ) -> tuple[float, Array, Array]:
-    """Return the share of matched detections, the motion (3,) and its information (3, 3) by the best start.
+    """Share of matched detections, the motion (3,) and its information (3, 3) by the best start.
 
     Where these starts match too little, further ones are tried, up to a distance (m).
     """
@@ -123,7 +123,7 @@ def register(
 
 
 def mean_twist(motion: Array, dt: float) -> Array:
-    """Return the constant twist (3,) of a motion (3,) in a time dt (s)."""
+    """Constant twist (3,) of a motion (3,) in a time dt (s)."""
     turn = motion[2]
     way = (motion[0] + 1j * motion[1]) * np.exp(-0.5j * turn) / np.sinc(turn / (2.0 * pi))
     return np.array([way.real, way.imag, turn]) / dt
@@ -201,7 +201,7 @@ class Regression:
         self._information, self._of_way = np.linalg.inv(variance), np.linalg.inv(variance[:, :2, :2])
 
     def stated(self, content: Content, lag: float) -> tuple[Complex, Array]:
-        """Return the mean velocities and yaw rates (P,) that the odometry states for the motions."""
+        """Mean velocities and yaw rates (P,) that the odometry states for the motions."""
         begin, end = self.motions.begin - lag, self.motions.end - lag
         way, turn = (
             (np.interp(end, self._t, one) - np.interp(begin, self._t, one)) / (end - begin)
@@ -214,7 +214,7 @@ class Regression:
         return fit.gain * v + 1j * fit.lever * fit.rate * w, fit.rate * w
 
     def odometry(self, fit: Fit) -> Odometry:
-        """Return the odometry that a fit takes for that of the sensor."""
+        """Odometry that a fit takes for that of the sensor."""
         way, turn = (np.gradient(one, self._t) for one in self._sums[fit.content])
         v = fit.gain * (np.abs(way) if fit.content == "pose" else way)
         return Odometry(self._t + fit.lag, np.column_stack([v.real, v.imag, fit.rate * turn]))
@@ -223,7 +223,7 @@ class Regression:
         return self.shares(*self.predicted(fit))
 
     def shares(self, v: Complex, w: Array) -> Shares:
-        """Return the degrees to which velocities and yaw rates (P,) explain the motions."""
+        """Degrees to which velocities and yaw rates (P,) explain the motions."""
         off = self._off(v, w)
         way = np.einsum("pi,pij,pj->p", off[:, :2], self._of_way, off[:, :2])
         both = np.einsum("pi,pij,pj->p", off, self._information, off)
@@ -260,7 +260,7 @@ class Regression:
         return factors, np.sqrt(np.abs(np.diag(inverse @ (scores.T @ scores.conj()) @ inverse)))
 
     def best(self) -> tuple[Fit, dict[str, Better]]:
-        """Return the simplest fit that no other explains far more than, with a refined lag.
+        """Simplest fit that no other explains far more than, with a refined lag.
 
         It comes with the reasons why its `content` and its `lag` are not those of a good log.
         """
@@ -282,7 +282,7 @@ class Regression:
         return fit, {name: better for name, better in why.items() if better}
 
     def lag(self, fit: Fit) -> tuple[float, float]:
-        """Return how much later than by a fit the stamps of the detections are (s), and its sigma."""
+        """How much later than by a fit the stamps of the detections are (s), and its sigma."""
         total, information = 0.0, self._information
         for _ in range(STEPS):
             lags = fit.lag + total + LAG_STEP * np.array([-1.0, 0.0, 1.0])
@@ -295,7 +295,7 @@ class Regression:
         return total, float(np.linalg.norm(in_blocks(scores))) / curvature
 
     def jump(self, fit: Fit) -> tuple[float, float, float, Array]:
-        """Return when the lag jumps, if it does (s), both lags (s), and the explained shares (P,)."""
+        """When the lag jumps, if it does (s), both lags (s), and the explained shares (P,)."""
         shares = np.stack([self.explained(replace(fit, lag=lag)).both for lag in LAGS])
         sums = shares.cumsum(axis=1)
         rest = sums[:, -1:] - sums
@@ -305,7 +305,7 @@ class Regression:
         return float(self.motions.end[k]), LAGS[before], LAGS[after], explained
 
     def around(self) -> tuple[Complex, Array]:
-        """Return medians (P,) of successive motions, which explain what the cones show."""
+        """Medians (P,) of successive motions, which explain what the cones show."""
         v = self.motions.velocity
         columns = np.column_stack([v.real, v.imag, self.motions.rate])
         vx, vy, rate = scipy.ndimage.median_filter(columns, size=(AROUND, 1), mode="nearest").T
