@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph import FixedLagMapper, MapperSettings
-from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
+from pathspace_graph.batch.lap import LapMarginal, OpenLap, lap_optimum, solve_lap
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.start import REVISIT_INTERVAL
 from pathspace_graph.factors.arrays import Array
@@ -238,6 +238,17 @@ def test_a_batch_has_all_revisits_so_far_some_metres_apart() -> None:
     assert [len(lap.revisits) for lap in laps[:count]] == [*range(1, count + 1)]
     driven = path_lengths(true_poses(drive()))[[one.later for one in mapper.revisits]]
     assert np.diff(driven).min() > REVISIT_INTERVAL - 1.0
+
+
+def test_an_open_road_is_solved_as_the_window_has_it() -> None:
+    """On its own knots, with the window's standard deviation across a curve and its confirmed ends."""
+    lap = sent()[1][0]
+    assert lap.start is not None and lap.start.is_open
+    system, at, _ = lap_optimum(lap)
+    assert system.settings == lap.settings
+    for label, boundary in at.state.boundaries.items():
+        assert boundary.confirmed_end == lap.start.ends[label] < boundary.tables.high
+        np.testing.assert_array_equal(boundary.knots, lap.start.splines[label].knots)
 
 
 @pytest.mark.parametrize("gaps", [0, 1, -1])

@@ -20,6 +20,7 @@ from pathspace_graph.places.find import (
     along,
     find,
 )
+from pathspace_graph.places.find import _spread as spread
 from pathspace_graph.spline.bspline import BSpline
 
 SIDES = {LEFT: 2.0, RIGHT: -2.0}
@@ -193,3 +194,10 @@ def test_a_few_points_have_no_place() -> None:
     seen = seen_from(PEAR, poses)
     few = Constellation(*(column[: LEAST_CONES - 1] for column in seen.cones))
     assert find(few, known.seen, known.along(poses)) == []
+
+
+def test_hypotheses_are_spread_over_the_seam_of_a_closed_way() -> None:
+    """The last and the first point of a ring are neighbours; on an open road they are its ends."""
+    ends, order = np.array([0, 99]), [0, 1]
+    assert spread(ends, 100, order) == [0]
+    assert spread(ends, None, order) == [0, 1]

@@ -364,7 +364,7 @@ def test_an_open_road_meets_no_cones_again() -> None:
     assert return_to_beginning(sensor(true), true, UNCERTAIN, SETTINGS) is None
 
 
-@pytest.mark.parametrize(("lane", "is_same"), [(0.0, True), (2.0, True), (4.0, False)])
+@pytest.mark.parametrize(("lane", "is_same"), [(0.0, True), (2.0, True), (3.2, False), (4.0, False)])
 def test_another_road_beside_is_no_return(lane: float, is_same: bool) -> None:
     """The second pass is so far (m) to the left of the first, whose sensor has seen its cones as well."""
     first = along((40.0, 0.0))
