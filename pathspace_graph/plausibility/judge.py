@@ -50,7 +50,7 @@ def hints(log: Log) -> list[Hint]:
     t, stamps = log.odometry.t, [cycle.t for cycle in log.cycles] or [float(log.odometry.t[0])]
     if stamps[0] > t[-1] or stamps[-1] < t[0]:
         return [*found, hint_of("two clocks", begin=stamps[0], end=stamps[-1], first=t[0], last=t[-1])]
-    log = log.at_scale_one()
+    log = with_usual_noise(log.at_scale_one())
     of_cycles = gaps_and_reach(log)
     log, of_positions = positions_in_metres(log)
     log, of_rows = possible_rows(log)
@@ -70,6 +70,10 @@ LENGTH_UNITS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # by size (m)
 USUAL_STEPS: Final = 2e-4, 5.0  # shortest and longest usual time between rows (s)
 WITHOUT_DETECTIONS: Final = 10.0  # longest drive before the first detection or after the last one (s)
 DRIVING: Final = 0.1  # least share of the largest speed while driving
+MOST_NOISE: Final = (
+    (0.2, 0.1),
+    (0.2, 0.05),
+)  # largest noise along the ray and across it, at 0 m and per m
 LEAST_CYCLES: Final = 100  # least number of cycles whose typical number of detections tells the sensor's
 USUAL_RANGES: Final = 0.05, 20.0, 120.0  # typical ranges of cones: least, of the likelier unit, most (m)
 FASTEST: Final = 100.0, 8.0  # speed (m/s) and yaw rate (rad/s) that no vehicle exceeds in a tenth of its time
@@ -108,6 +112,20 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
     odometry = replace(log.odometry, t=log.odometry.t * sizes[ODOMETRY_FILE])
     cycles = tuple(replace(cycle, t=cycle.t * sizes[DETECTIONS_FILE]) for cycle in log.cycles)
     return replace(log, odometry=odometry, cycles=cycles), found
+
+
+def with_usual_noise(log: Log) -> Log:
+    """Return the log with at most a usual noise of detections: measured by wrong odometry, it is larger."""
+    noise = log.measured
+    if log.detections_stated or noise is None or noise.along is None or noise.across is None:
+        return log
+    along, across = (
+        replace(one, sigma=np.minimum(one.sigma, most))
+        for one, most in zip((noise.along, noise.across), MOST_NOISE, strict=True)
+    )
+    usual = replace(noise, along=along, across=across)
+    known = ((cycle, usual.covariances(cycle.points_vehicle, inflated=False)) for cycle in log.cycles)
+    return replace(log, cycles=tuple(replace(cycle, covariances=C) for cycle, C in known if C is not None))
 
 
 def gaps_and_reach(log: Log) -> list[Hint]:
@@ -224,7 +242,7 @@ WELL_EXPLAINED: Final = 0.5  # least explained share for a small turn and a plac
 FAR_LESS: Final = 0.4  # largest share that a fit explains of another drive, by what the cones show
 SIDES_TOLD: Final = 0.015  # least difference between the lags of both sides that is told (s),
 SIDES_CLEAR: Final = 4.0  # and in standard deviations
-SIDES: Final = 2000, 300  # approximate number of cycles of a side in use, and least number of motions
+SIDES: Final = 2000, 200  # approximate number of cycles of a side in use, and least number of motions
 FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation (degrees) and whether mirrored
     (180, False): ("the sensor's frame has x to the rear and y to the right", "-x", "-y"),
     (-90, False): ("the sensor's frame has x to the right and y ahead", "y", "-x"),
@@ -268,8 +286,9 @@ def motion_hints(log: Log) -> list[Hint]:
     if unexplained and not lines and explained.both.mean() < UNEXPLAINED[1]:
         return unexplained
     tell(told, why.get("content"), "pose" if fit.content == "pose" else "fixed frame")
-    when, before, after, jumping = regression.jump(fit)
-    if jump := far_better(jumping, np.maximum(explained.both, rest.both)):
+    when, before, after, jumping, constant = regression.jump(fit)
+    jump = far_better(jumping, np.maximum(explained.both, rest.both))
+    if jump and far_better(jumping, constant):
         tell(told, jump, "clock jumps", seconds=after - before, when=when)
     else:
         late = why.get("lag") if abs(fit.lag) > LATE_TOLD else None
@@ -365,10 +384,13 @@ def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log) -> None:
 
 
 def side_hints(log: Log) -> list[Hint]:
-    """Return a hint if the motions that cones on the left and on the right show disagree in time."""
+    """Return a hint if the motions that cones on the left and on the right show disagree in time.
+
+    The sides are those of the vehicle, as of two cameras; in a bend a left cone may be on the right.
+    """
     lags, (most, least) = [], SIDES
-    for side in (LEFT, RIGHT):
-        cycles = tuple(cycle.where(cycle.labels == side) for cycle in log.cycles)
+    for side in (1.0, -1.0):
+        cycles = tuple(cycle.where(side * cycle.points_vehicle[:, 1] > 0.0) for cycle in log.cycles)
         motions = motions_of(replace(log, cycles=cycles), most, MIN_MATCHED, fastest=0.0)
         if len(motions.rate) < least:
             return []
