@@ -47,7 +47,7 @@ from .experiment.tables import Table, write_csv
 from .figures import style
 from .figures.style import MARKERS, PALETTE, WIDTH
 from .metrics.accuracy import mean_of
-from .metrics.metric import figure, figures
+from .metrics.measures import figure, figures
 from .metrics.summary import lap_times, versions
 
 # --- beside ISAM2 ----------------------------------------------------------------------------------------

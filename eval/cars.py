@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from pathspace_graph.batch.joint_mapper import join
+from pathspace_graph.batch.joint import join
 from pathspace_graph.batch.known_map import map_of_cones
 from pathspace_graph.batch.mapper import BatchResult
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE, make_batch, make_online, settings_of
@@ -25,10 +25,9 @@ from pathspace_graph.sim.track_generator import generate_track
 from .experiment.statistics import estimate
 from .experiment.tables import Table
 from .metrics.accuracy import lap_metrics, root_mean_square
-from .metrics.alignment import shape_rmse
+from .metrics.alignment import motion_onto, shape_rmse
 from .metrics.consistency import consistency_at_cones, map_nees
 from .metrics.reference import truth_of
-from .metrics.registration import motion_onto
 from .metrics.trajectory import interpolate_poses, position_rms, trajectory_errors
 
 Columns = Mapping[str, tuple[str, int, float]]  # of a table, by their key: heading, digits, factor

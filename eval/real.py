@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from pathspace_graph import estimators as registry
-from pathspace_graph.batch.joint_mapper import join
+from pathspace_graph.batch.joint import join
 from pathspace_graph.errors import SolveError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, wrap_angle
@@ -26,9 +26,8 @@ from .experiment.statistics import estimate
 from .experiment.study import Study
 from .experiment.tables import Table
 from .metrics.accuracy import crossings
-from .metrics.alignment import aligned_distance, maps_apart
-from .metrics.metric import UNKNOWN, figure, figures
-from .metrics.registration import end_by_registration
+from .metrics.alignment import aligned_distance, end_by_registration, maps_apart
+from .metrics.measures import UNKNOWN, figure, figures
 
 RUNS: Final = {  # estimator of each run
     "online": registry.DEFAULT_ONLINE,

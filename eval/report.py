@@ -25,7 +25,7 @@ from .experiment.run import RowsOf, make_plan, rows_of, run_study
 from .experiment.statistics import RUN_OF, estimate, last_laps
 from .experiment.study import Drive, Study, find_study, read_study_file
 from .experiment.tables import Table, by_metric, by_name, contrast_table, mean, write_csv
-from .metrics.metric import METRICS, UNKNOWN
+from .metrics.measures import METRICS, UNKNOWN
 from .metrics.reference import landmark_rmse, solve_oracle_landmarks, truth_of
 
 ONLINE, BATCH, LANDMARKS = "fixed-lag", "spline", "landmark-fixed-lag"

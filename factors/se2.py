@@ -14,6 +14,13 @@ def wrap_angle(angle: Array) -> Array:
     return -((np.pi - angle) % (2.0 * np.pi) - np.pi)
 
 
+def difference(poses: Array, others: Array) -> Array:
+    """Difference of poses (..., 3) as coordinates, with headings wrapped to (-pi, pi]."""
+    off = poses - others
+    off[..., 2] = wrap_angle(off[..., 2])
+    return off
+
+
 def rotation(theta: float) -> Array:
     """Rotation matrix R(theta) (2, 2) from the vehicle frame to the map frame."""
     c, s = cos(theta), sin(theta)

@@ -16,7 +16,7 @@ from pathspace_graph.front_end.front_end import FrontEnd
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT
 from pathspace_graph.loop.closed import Closed
-from pathspace_graph.loop.drive_record import DriveRecord
+from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.loop.map_repair import REPAIRED
 from pathspace_graph.loop.open import Open
 from pathspace_graph.mapping.road import Road

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pathspace_graph import SettingsError
-from pathspace_graph.batch.joint_mapper import solve_together
+from pathspace_graph.batch.joint import solve_together
 from pathspace_graph.cli import main
 from pathspace_graph.estimators import BATCH, ONLINE, make_batch, make_online
 from pathspace_graph.eval.metrics.measures import measure

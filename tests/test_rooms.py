@@ -229,12 +229,11 @@ ASSIGNED = {
     "batch.association": {"state.pose_u"},
     "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"state.pose_u"},
-    "graph.changes": {f"smoother.{part}" for part in ("prior", "submaps", "inactive", "held")}
-    | {"smoother.variables.first_cycle"},
-    "graph.smoother": {"self.variables.first_cycle", "self.submaps.first"},
+    "graph.smoother": {f"smoother.{part}" for part in ("prior", "inactive", "held", "calibration_prior")}
+    | {"smoother.variables.first_cycle", "self.variables.first_cycle"},
     "baselines.landmark_association": {"detections.landmark"},
     "baselines.landmark_batch": {"state.votes", "detections.landmark"},
-    "baselines.landmark_fixed_lag": {"smoother.map.loop_pairs", "self.smoother.window.exact"},
+    "baselines.landmark_fixed_lag": {"self.smoother.window.exact", "state.votes", "state.next_number"},
     "mapping.road": {"self.smoother.attached"},
     "mapping.smoother": {"self.window.exact"},
     "ros.node": {f"marker.{part}" for part in ("ns", "id", "type", "points", "scale.x", "pose.orientation.w")}

@@ -9,8 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.linalg import block_diag
 
-from pathspace_graph.baselines.ckf_curves import beyond_end, proximity_chain
-from pathspace_graph.baselines.ckf_update import fit_detections
+from pathspace_graph.baselines.ckf_curves import beyond_end, fit_detections, proximity_chain
 from pathspace_graph.factors.residuals import greville, smoothness_matrix
 from pathspace_graph.settings.mapper import CkfSettings
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track

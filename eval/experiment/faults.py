@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import pandas as pd
 
 from pathspace_graph.errors import SettingsError, check_name
-from pathspace_graph.eval.metrics.metric import METRICS, figures
+from pathspace_graph.eval.metrics.measures import METRICS, figures
 from pathspace_graph.io.files import write_json
 from pathspace_graph.plausibility.diagnosis import PRIOR_LIMIT
 

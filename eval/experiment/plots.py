@@ -12,7 +12,7 @@ from pathspace_graph.eval.figures import map_plot, style
 from pathspace_graph.eval.figures.map_plot import MARGIN
 from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH
 from pathspace_graph.eval.metrics.accuracy import mapped_points
-from pathspace_graph.eval.metrics.metric import METRICS, PAPER
+from pathspace_graph.eval.metrics.measures import METRICS, PAPER
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map

@@ -24,8 +24,7 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, OutputError, SettingsError, SolveError, install
 from pathspace_graph.eval.metrics.alignment import aligned_distance
-from pathspace_graph.eval.metrics.measures import measure, online_cycles, stage_times
-from pathspace_graph.eval.metrics.metric import METRICS
+from pathspace_graph.eval.metrics.measures import METRICS, measure, online_cycles, stage_times
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times, summarize, versions
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
 from pathspace_graph.io.files import atomic_folder, check_target, to_plain, write_json, write_text

@@ -9,7 +9,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from pathspace_graph.eval.metrics.metric import METRICS, figure
+from pathspace_graph.eval.metrics.measures import METRICS, figure
 from pathspace_graph.factors.arrays import Array
 
 from .study import Study

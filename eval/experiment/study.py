@@ -13,7 +13,7 @@ import numpy as np
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError, check_name
-from pathspace_graph.eval.metrics.metric import METRICS
+from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.io.files import is_temporary
 from pathspace_graph.io.log import FILES, LOG_FILE, Log
 from pathspace_graph.io.overrides import Overrides, apart, flatten, override

@@ -12,7 +12,7 @@ from rich.text import Text
 from tabulate import LATEX_ESCAPE_RULES
 
 from pathspace_graph.eval.figures.style import save_figures
-from pathspace_graph.eval.metrics.metric import METRICS, UNKNOWN, Metric, figure
+from pathspace_graph.eval.metrics.measures import METRICS, UNKNOWN, Metric, figure
 from pathspace_graph.io.files import replacing, write_text
 
 from .plots import plot_differences

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pathspace_graph.baselines.landmark_batch import LandmarkSystem, solve_landmarks
-from pathspace_graph.baselines.landmark_map import LandmarkState
+from pathspace_graph.baselines.landmark_map import LandmarkState, LandmarkSystem, solve_landmarks
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.covariances import ray_covariances
 from pathspace_graph.io.log import Detections, Log, Truth

@@ -46,7 +46,7 @@ inline void turn_pairs(double* values, const Ints& columns, double c, double s) 
   }
 }
 
-// Move values from the map frame into that of a pose: graph.relative:to_frame.
+// Move values from the map frame into that of a pose: graph.inactive:to_frame.
 inline void to_frame(double* values, const Ints& turning, const Ints& headings, const double* frame,
                      const Turn& turn) {
   for (Index k = 0; k < turning.size(); ++k) {

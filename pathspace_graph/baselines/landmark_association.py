@@ -9,7 +9,7 @@ import scipy  # imports its modules on first use
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
 from pathspace_graph.factors.sensor import by_sensor
-from pathspace_graph.graph.changes import merge_points
+from pathspace_graph.graph.smoother import merge_points
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.tentative import nearest_within

@@ -1,30 +1,20 @@
-"""The Hungarian landmark graph over a whole log: all poses and landmarks at once, with iterated associations.
+"""The Hungarian landmark graph over a whole log: all poses and landmarks, with iterated associations."""
 
-With oracle associations it is the limit of accuracy of a log. There are no outliers then, and no robust
-weights.
-"""
-
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import ClassVar, Final
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.batch.association import insert_drive
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.noise import KnownNoise, huber_loss
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.residuals import landmark_residuals
-from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.front_end.front_end import is_orange, judge_log
-from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
-from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph, owners
-from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import POINT, POSE, indices
+from pathspace_graph.graph.elimination import Elimination
+from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.results import BatchRun, RunNoise
-from pathspace_graph.labels import BOUNDARIES, RIGHT
+from pathspace_graph.io.results import BatchRun
+from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.mapping.tentative import TentativeTracks
@@ -34,7 +24,7 @@ from pathspace_graph.settings.mapper import MapperSettings, known_settings
 from . import landmark_association as association
 from .landmark_association import MATCH_GATE, find_duplicates
 from .landmark_fixed_lag import LandmarkFixedLag
-from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, landmark_rows, point_map
+from .landmark_map import UNASSOCIATED, LandmarkDetections, LandmarkState, LandmarkSystem, point_map
 
 LANDMARK_BATCH: Final = "landmark-batch"  # name of the estimator on the command line
 MAX_ROUNDS: Final = 10  # largest number of rounds of association
@@ -69,7 +59,7 @@ class LandmarkBatch:
                 break
         return self._result(system, state, converged)
 
-    def _refresh(self, system: "LandmarkSystem", state: LandmarkState) -> int:
+    def _refresh(self, system: LandmarkSystem, state: LandmarkState) -> int:
         detections, before, known = system.detections, system.detections.landmark.copy(), len(state)
         again = Reassociation(state, system, self.settings)
         again.run()
@@ -78,7 +68,7 @@ class LandmarkBatch:
         remove_rare(state, detections, self.settings.growth.sightings)
         return int((before != detections.landmark).sum())
 
-    def _result(self, system: "LandmarkSystem", state: LandmarkState, converged: bool) -> BatchRun:
+    def _result(self, system: LandmarkSystem, state: LandmarkState, converged: bool) -> BatchRun:
         laps, problem, poses = LapCounter(), system.eliminated(state), state.variables.poses.copy()
         for pose in poses:
             laps.update(pose)
@@ -95,79 +85,14 @@ class LandmarkBatch:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class LandmarkSystem:
-    """Minimizes `1/2 |odometry|^2 + sum rho(associated detections) + 1/2 |calibration, first pose|^2`."""
-
-    detections: LandmarkDetections
-    chain: LogOdometry
-    settings: MapperSettings
-    noise: RunNoise
-
-    @classmethod
-    def of_log(cls, log: Log, settings: MapperSettings, noise: KnownNoise) -> "LandmarkSystem":
-        """Set up the problem of a log without associations; `noise` is known before the drive."""
-        judged = judge_log(log, noise, settings)
-        detections = LandmarkDetections.of(judged.cycles, twists=judged.chain.twists)
-        return cls(detections, judged.chain, judged.settings, judged.noise)
-
-    def cost(self, state: LandmarkState) -> float:
-        """Half the sum of squares at a state, with Huber's loss of the detections."""
-        *drive, detections = self.rows(state, np.inf)
-        return half_square(drive) + float(huber_loss(detections.residual, self.settings.gate.huber).sum())
-
-    def rows(self, state: LandmarkState, huber: float) -> list[Rows]:
-        """All rows, those of the detections last, weighted by a Huber threshold (sigmas)."""
-        rows = landmark_rows(state, self.detections, np.flatnonzero(self.detections.used), huber)
-        labels = state.labels[state.positions(indices(rows.keys[:, -1]))]
-        seen = replace(rows, owner=owners(rows.owner, labels == RIGHT))
-        return [*self.chain.rows_at(state.variables, self.settings.calibration), seen]
-
-    def eliminated(self, state: LandmarkState) -> Elimination:
-        graph = linear_graph(self.rows(state, self.settings.gate.huber), state.variables)
-        return Elimination(graph, state.variables.layout)
-
-    def optimize(self, state: LandmarkState) -> None:
-        """Optimize a state by Levenberg-Marquardt with fixed associations; only the map is damped."""
-        variables, cost, damping = state.variables, self.cost(state), Damping()
-        for _ in range(MAX_STEPS):
-            problem, before = self.eliminated(state), variables.values
-            variables.values = before + problem.step(damping.weight * np.diagonal(problem.information))
-            gain = cost - self.cost(state)
-            if gain < 0.0:
-                variables.values = before
-                damping.grow()
-            else:
-                cost -= gain
-                damping.lower()
-            if damping.exhausted or 0.0 <= gain <= GAIN_TOLERANCE * cost:
-                break
-        self.detections.correct(variables.sensor)
-
-
 def start_landmarks(
     log: Log, system: LandmarkSystem, noise: KnownNoise
 ) -> tuple[LandmarkSystem, LandmarkState]:
     """Return the last map of the online run, with each pose and association as of its end in the window."""
     online = LandmarkFixedLag(system.settings, noise)
-    detections, smoother, track = system.detections, online.smoother, online.smoother.map
-    poses = np.zeros((len(log.cycles), POSE))
-    landmark = np.full(len(detections), UNASSOCIATED, np.intp)
-    begins = np.searchsorted(detections.cycle, np.arange(len(log.cycles)))
     for odometry, cycle in split_odometry(log):
         online.update(odometry, cycle)
-        first = smoother.first_cycle
-        poses[first : smoother.next_cycle] = smoother.variables.poses
-        landmark[begins[first] : begins[first] + len(track.detections)] = track.detections.landmark
-    final = np.arange(track.state.next_number)
-    for gone, kept in sorted(track.merged_into.items()):  # ascending, so that `kept` is already final
-        final[gone] = final[kept]
-    rows = np.flatnonzero(landmark >= 0)
-    detections.take(rows, final[landmark[rows]])
-    state = LandmarkState()
-    state.add(track.state.landmarks, track.state.labels, track.state.numbers)
-    state.votes, state.next_number = track.state.votes, track.state.next_number
-    insert_drive(state.variables, smoother.variables.calibrations, poses)
+    state = online.whole_drive(system.detections)
     sigma = np.array(online.inflated.odometry.sigmas)
     chain = replace(system.chain, calibration_sigma=sigma)  # priors at the end of the online run
     return replace(system, settings=online.inflated, chain=chain), state
@@ -275,38 +200,3 @@ def remove_rare(state: LandmarkState, detections: LandmarkDetections, fewest: in
     detections.landmark[np.isin(detections.landmark, state.numbers[gone])] = UNASSOCIATED
     state.variables.remove(state.keys[gone])
     state.keep(~gone)
-
-
-def solve_landmarks(
-    log: Log, associations: IntArray, settings: MapperSettings | None = None
-) -> tuple[LandmarkSystem, LandmarkState]:
-    """Minimize all squared Mahalanobis distances over poses, calibration and landmarks, without robust loss.
-
-    associations (R,) are the landmark numbers of all detections in file order. Negative ones and orange cones
-    are left out.
-    """
-    associations = associations[~np.concatenate([is_orange(cycle) for cycle in log.cycles])]
-    settings = settings or MapperSettings()
-    settings = replace(settings, gate=replace(settings.gate, huber=np.inf))
-    drift = np.zeros(3) if log.odometry_drift is None else log.odometry_drift
-    system = LandmarkSystem.of_log(log, settings, KnownNoise(log.odometry_sigma, drift=drift))
-    state = start_oracle(system, associations)
-    system.optimize(state)
-    return system, state
-
-
-def start_oracle(system: LandmarkSystem, associations: IntArray) -> LandmarkState:
-    """Associate the system's detections with landmarks (R,); return the state by dead reckoning."""
-    detections, rows = system.detections, np.flatnonzero(associations >= 0)
-    numbers, first, landmark = np.unique(associations[rows], return_index=True, return_inverse=True)
-    detections.take(rows, numbers[landmark])
-    calibration = np.array(system.settings.calibrations)
-    poses = system.chain.dead_reckoned(calibration[:CALIBRATION_SIZE])
-    points = to_map(detections.point[rows[first]], poses[detections.cycle[rows[first]]])
-    votes = np.zeros((len(numbers), 3), np.intp)  # left, right, unknown
-    np.add.at(votes, (landmark, detections.label[rows]), 1)
-    state = LandmarkState()
-    state.add(points, votes.argmax(axis=1), numbers.astype(np.intp))
-    state.votes = votes[:, : len(BOUNDARIES)]
-    insert_drive(state.variables, calibration, poses)
-    return state

@@ -8,15 +8,16 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from pathspace_graph.batch.association import insert_drive
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import chi2_quantile
 from pathspace_graph.front_end.front_end import Reading
-from pathspace_graph.graph.changes import solve_loop
-from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.variables import POINT
+from pathspace_graph.graph.smoother import FixedLagSmoother, restart, set_prior
+from pathspace_graph.graph.variables import NO_KEYS, ONE_DRIVE, POINT
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.mapping import motion as motions
 from pathspace_graph.mapping.motion import predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
@@ -25,7 +26,17 @@ from pathspace_graph.run import CycleResult, Readings, Stopwatch
 
 from . import landmark_association as association
 from .landmark_association import CREATE, MATCH_GATE, difference_covariances
-from .landmark_map import SIGMA_MERGE, UNASSOCIATED, LandmarkMap, LandmarkSmoother, landmark_counts, point_map
+from .landmark_map import (
+    SIGMA_MERGE,
+    UNASSOCIATED,
+    LandmarkDetections,
+    LandmarkMap,
+    LandmarkSmoother,
+    LandmarkState,
+    LandmarkSystem,
+    landmark_counts,
+    point_map,
+)
 from .online import FRONT_END, OnlineBaseline
 
 UNSEEN_PATH: Final = 40.0  # path without a detection after which a landmark is old (m)
@@ -50,6 +61,9 @@ class LandmarkFixedLag(OnlineBaseline):
         self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
         self.inflated = self.settings  # settings with the present priors of the calibrations
         self.closed = False
+        self.record = DriveRecord(self.settings)
+        self._left: list[tuple[Array, IntArray]] = []
+        """Poses (k, 3) that left the window, and landmarks (m,) of their detections, as of then."""
         self._last_detected: Array = np.zeros(
             0
         )  # path length at each landmark's last detection, by number (m)
@@ -57,6 +71,7 @@ class LandmarkFixedLag(OnlineBaseline):
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
         motion, detections = reading.motion, reading.detections
+        self.record.measured(reading)
         predict(self.smoother, self.path, motion, detections.t)
         watch.lap("predict")
         new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.odometry.twist)
@@ -66,11 +81,24 @@ class LandmarkFixedLag(OnlineBaseline):
                 self.smoother, self.inflated, reading.sensor_doubted, reading.measured
             )
         watch.lap("update")
-        self._close()
+        self._close(reading)
         watch.lap("close")
-        self.smoother.marginalize()
+        self._marginalize()
         watch.lap("marginalize")
         return self._result(detections.t, watch.laps)
+
+    def _marginalize(self) -> None:
+        smoother, table = self.smoother, self.smoother.map.detections
+        first, poses, cycle, landmark = (
+            smoother.first_cycle,
+            smoother.variables.poses,
+            table.cycle,
+            table.landmark,
+        )
+        smoother.marginalize()
+        left = smoother.first_cycle - first
+        if left:
+            self._left.append((poses[:left].copy(), landmark[cycle < smoother.first_cycle].copy()))
 
     def _use(self, new: slice, t: float, watch: Stopwatch) -> None:
         eligible = np.ones(len(self.smoother.map.state), bool)
@@ -116,7 +144,25 @@ class LandmarkFixedLag(OnlineBaseline):
         last_detected = self._last_detected[self.smoother.map.state.numbers]
         return np.asarray(last_detected < self.path.length - UNSEEN_PATH)
 
-    def _close(self) -> None:
+    def whole_drive(self, detections: LandmarkDetections) -> LandmarkState:
+        """Associate the detections of all cycles, and return the map with all poses.
+
+        Each association and pose is as of its end in the window.
+        """
+        track, variables = self.smoother.map, self.smoother.variables
+        state, final = LandmarkState(), np.arange(track.state.next_number)
+        for gone, kept in sorted(track.merged_into.items()):  # ascending, so that `kept` is already final
+            final[gone] = final[kept]
+        landmark = np.concatenate([*(landmark for _, landmark in self._left), track.detections.landmark])
+        rows = np.flatnonzero(landmark >= 0)
+        detections.take(rows, final[landmark[rows]])
+        state.add(track.state.landmarks, track.state.labels, track.state.numbers)
+        state.votes, state.next_number = track.state.votes, track.state.next_number
+        poses = np.concatenate([*(poses for poses, _ in self._left), variables.poses])
+        insert_drive(state.variables, variables.calibrations, poses)
+        return state
+
+    def _close(self, reading: Reading) -> None:
         """Close the loop, or merge duplicates after closure, every few metres."""
         detections, state, length = self.smoother.map.detections, self.smoother.map.state, self.path.length
         detected = np.unique(detections.landmark[detections.used])
@@ -135,9 +181,24 @@ class LandmarkFixedLag(OnlineBaseline):
             recent, old = state.positions(detected), np.flatnonzero(self._old())
             pairs = detect_loop(self.smoother, recent, old, reach)
             if pairs is not None:
-                optimize_loop(self.smoother, *pairs)
                 self._merge(*pairs)
+                self._solve_drive(reading)
                 self.closed, self.smoother.window.exact = True, False
+
+    def _solve_drive(self, reading: Reading) -> None:
+        """Replace the map by the optimum of the whole drive, and the prior by its marginal."""
+        smoother, first, noise = self.smoother, self.smoother.first_cycle, self.front_end.noise_used
+        drive = self.record.lap(first, None, (), self.inflated, reading.noise)
+        detections = LandmarkDetections.of_drives([drive.detections], ONE_DRIVE)
+        system = LandmarkSystem(detections, drive.chain, self.inflated, noise)
+        solved = self.whole_drive(detections)
+        system.optimize(solved)
+        restart(smoother, first, NO_KEYS, NO_KEYS, np.zeros((0, POINT)))
+        variables = smoother.variables
+        variables.values = solved.variables.values[solved.variables.layout.entries(variables.keys)]
+        set_prior(smoother, *system.marginal(solved, first))
+        for _ in range(self.settings.closing.iterations):
+            smoother.step()
 
     def _merge(self, gone: IntArray, kept: IntArray) -> None:
         if len(gone):
@@ -244,9 +305,3 @@ def detect_loop(
     enough = all((labels == label).sum() >= MIN_PAIRS // 3 for label in BOUNDARIES)
     fits = distance < chi2_quantile(CREATE, POINT * len(labels))
     return (recent[i], old[j]) if enough and len(labels) >= MIN_PAIRS and fits else None
-
-
-def optimize_loop(smoother: LandmarkSmoother, recent: IntArray, old: IntArray) -> None:
-    """Solve the whole loop with constraints between pairs (k,); merge them later."""
-    smoother.map.loop_pairs = smoother.map.state.numbers[np.column_stack([recent, old])]
-    solve_loop(smoother, smoother.map.settings.closing.iterations, None)

@@ -1,4 +1,4 @@
-"""Association in a batch: poses along the curves, detections on curves, and detections of cones."""
+"""Association in a batch: poses along the curves, detections on curves and stations, and of cones."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -11,10 +11,10 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import sigma_across
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
-from pathspace_graph.graph.drives import Drives
-from pathspace_graph.graph.variables import Variables, pose_keys
+from pathspace_graph.graph.variables import Drives, Variables, pose_keys
 from pathspace_graph.labels import UNKNOWN
-from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.detection_rows import SIGMA_POSE, Stations
+from pathspace_graph.mapping.detections import NO_STATION, DetectionTable
 from pathspace_graph.mapping.path import LATERAL_GAP, ROW_BESIDE, SIDES, in_front_row
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tentative import nearest_within
@@ -409,3 +409,69 @@ def _peaks(u: Array, weight: Array, length: float, periodic: bool, apart: float)
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(smooth, reach), 2 * reach + 1)
     highest = (smooth > 0.0) & (smooth >= windows.max(axis=1))
     return np.asarray((np.flatnonzero(highest[reach : reach + bins]) + 0.5) * step, np.float64)
+
+
+# --- stations of closed curves ---------------------------------------------------------------------------
+
+
+SIGMA_STATION: Final = (
+    0.02  # standard deviation of a cone along a curve with a control point for each cone (m)
+)
+
+
+@dataclass(frozen=True, eq=False)
+class StationMatches:
+    """The stations of a batch's closed curves, and their unambiguous detections."""
+
+    stations: Stations
+    rows: IntArray  # (m,) detections, by row of the table
+    station: IntArray  # (m,) station of each
+    sigma: Array  # (m,) standard deviations along the curve, of detection and station (m)
+
+    def used(self, detections: DetectionTable) -> tuple[IntArray, IntArray, Array]:
+        """Return rows, stations and sigmas (k,) of detections in use on the boundary of their station."""
+        on_boundary = detections.boundary[self.rows] == self.stations.label[self.station]
+        chosen = detections.used[self.rows] & on_boundary
+        return self.rows[chosen], self.station[chosen], self.sigma[chosen]
+
+
+def match_stations(
+    state: State, detections: DetectionTable, settings: MapperSettings
+) -> StationMatches | None:
+    """Match all detections to stations of closed curves, the cones of the first drive's first lap.
+
+    None if a curve has too few cones, or detections are of lines. A lap misses its beginning by some
+    decimetres, which would smear the cones of both ends and match a later lap to neighbours. So the first lap
+    places the cones; revisits have aligned the later ones.
+    """
+    if settings.of_lines:
+        return None
+    places = {}
+    for label in state.boundaries:
+        first = detections.where(np.flatnonzero(laps_of(state, detections, label) <= 0)).of_drive(0)
+        cones = cones_of_curve(state, first, label, settings)
+        if len(cones.u) < ROW_CONES:
+            return None
+        places[label] = feet_of_cones(state, cones, label).u
+    sigmas = {label: np.full(len(u), SIGMA_STATION) for label, u in places.items()}
+    stations = Stations.of(state, places, sigmas)
+    rows, station, sigma = [], [], []
+    for curve in stations.curves:
+        own = detections.used_on(curve.label)
+        own = own[detections.label[own] == curve.label]
+        u, poses = detections.u[own], state.variables.poses_at(detections.cycle[own])
+        tangent = state.spline(curve.label).tangent_unit(u)
+        along = sigma_across(tangent, detections.covariance[own], poses, 0.0)
+        match = curve.matched(u, np.hypot(along, SIGMA_POSE))
+        rows.append(own[match != NO_STATION])
+        station.append(match[match != NO_STATION])
+        sigma.append(np.hypot(along, SIGMA_STATION)[match != NO_STATION])
+    return StationMatches(stations, *map(np.concatenate, (rows, station, sigma)))
+
+
+def laps_of(state: State, detections: DetectionTable, label: int) -> IntArray:
+    """Lap (m,) on a closed curve in which each detection's foot point was passed, from 0."""
+    pose_u, length = state.pose_u[label], state.boundaries[label].length
+    at = pose_u[detections.cycle]
+    ahead = ahead_of(at, detections.u, length)
+    return np.asarray(np.floor((at + ahead - pose_u[0]) / length), np.intp)

@@ -5,31 +5,45 @@ calibration; drives of one vehicle share the sensor's. Common observations conne
 stations, and poses of a later drive in the frame of an earlier one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
+from pathspace_graph.errors import SettingsError, SolveError, solving
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import compose, inverse, move_points, path_lengths
 from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.front_end.log_odometry import LogOdometry
-from pathspace_graph.graph.drives import Drives, of_sensor
 from pathspace_graph.graph.elimination import owners
-from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, are_poses, pose_keys
+from pathspace_graph.graph.rows import Revisit, Rows
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    SENSOR_KEY,
+    Drives,
+    are_poses,
+    of_sensor,
+    pose_keys,
+)
+from pathspace_graph.io.log import Log
+from pathspace_graph.io.map import PointBoundary
+from pathspace_graph.lengths import scaled
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.places.constellation import Prior
+from pathspace_graph.places.constellation import Constellation, Prior
+from pathspace_graph.places.find import KnownRoad, find, sure
 from pathspace_graph.places.passes import NEARBY, find_return, revisit_of, seen_in
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.run import Stopwatch
+from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .association import locate_poses
-from .mapper import BatchResult
-from .objections import disagreement
+from .lap import disagreement
+from .mapper import BatchMapper, BatchResult, Found, frame_of, map_of, result_of, with_wider_priors
+from .optimizer import Optimizer
 from .simplification import boundary_of
 from .system import BatchSystem
 
@@ -167,3 +181,231 @@ def revisits_between(system: JointSystem, state: State) -> list[Revisit]:
             if again is not None:
                 found.append(revisit_of(again[0], poses, again[1], newest))
     return found
+
+
+# --- the place of a drive --------------------------------------------------------------------------------
+
+
+LEAST_DRIVEN: Final = 30.0  # least length of a drive (m)
+PLACED_STRETCH: Final = 60.0  # length of a stretch of a drive that determines its place (m)
+FROM_START: Final = 60.0  # length of the first path, whose cones determine the place on an open road (m)
+ABOUT_START: Final = (5.0, 2.0, 0.1), (15.0, 0.3)
+"""Sigmas (m, m, rad) and largest distance (m, rad) of the starts of two drives of an open road."""
+
+OTHER_TRACK: Final = "it fits nowhere on the map of the other drives"
+OTHER_WAY: Final = "it goes the other way round"
+TWO_PLACES: Final = "it fits in two places of the map of the other drives"
+OTHER_START: Final = "its cones do not determine where it begins on the open road of the other drives"
+
+
+class NotPlacedError(Exception):
+    """A drive has no sure place on the map; the message says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """A drive that was solved alone: curves, poses, and the detections on the curves."""
+
+    state: State
+    detections: DetectionTable
+    settings: MapperSettings
+
+    @cached_property
+    def driven(self) -> Array:
+        """Length (m) of the path to each pose (P,)."""
+        return path_lengths(self.state.poses)
+
+    def seen(self, begin: float = 0.0, end: float = np.inf) -> Constellation:
+        """Return the cones or points of lines detected on a stretch of the drive (m), in its frame."""
+        cycles = np.flatnonzero((self.driven >= begin) & (self.driven <= end))
+        table, of_lines = seen_in(self.detections)(cycles), self.settings.of_lines
+        return Constellation.of(table, self.state.poses, self.settings.growth, of_lines=of_lines)
+
+    @cached_property
+    def road(self) -> KnownRoad:
+        """The drive's map as a known road."""
+        road = KnownRoad.of(self.state.splines)
+        return road if self.settings.of_lines else replace(road, seen=self.seen())
+
+
+def find_place(known: Driven, drive: Driven) -> Array:
+    """Find the motion (3,) of a drive onto a known one; NotPlacedError if none is sure.
+
+    Hypotheses along an open road are ambiguous, so both drives must begin at about the same place there.
+    """
+    if drive.driven[-1] < LEAST_DRIVEN:
+        raise NotPlacedError(f"it is shorter than {LEAST_DRIVEN:g} m")
+    if not known.state.closed:
+        places = find(drive.seen(0.0, FROM_START), known.road.seen, Prior.about(np.zeros(3), *ABOUT_START))
+        if (place := sure(places)) is None:
+            raise NotPlacedError(OTHER_START)
+        return place.pose
+    motion, found = _by_stretches(known.road, drive)
+    if motion is not None:
+        return motion
+    backwards, _ = _by_stretches(known.road.backwards(), drive)
+    if backwards is not None:
+        raise NotPlacedError(OTHER_WAY)
+    raise NotPlacedError(TWO_PLACES if found else OTHER_TRACK)
+
+
+def _by_stretches(road: KnownRoad, drive: Driven) -> tuple[Array | None, bool]:
+    """Return the motion of the first stretch with a sure place, and whether one fits anywhere."""
+    fits, ends = False, np.arange(PLACED_STRETCH, float(drive.driven[-1]) + PLACED_STRETCH, PLACED_STRETCH)
+    for end in np.minimum(ends, drive.driven[-1]).tolist():
+        within = (drive.driven >= end - PLACED_STRETCH) & (drive.driven <= end)
+        poses = drive.state.poses[within]
+        seen = drive.seen(end - PLACED_STRETCH, end).seen_from(poses[-1])
+        places = find(seen, road.seen, road.along(poses))
+        if (place := sure(places)) is not None:
+            return compose(place.pose, inverse(poses[-1])), True
+        fits |= bool(places) and places[0].odds > -np.inf
+    return None, fits
+
+
+# --- the batch of several drives -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class JointResult:
+    """The map of several drives, and the result of each."""
+
+    drives: dict[str, BatchResult]
+    """Result of each drive in the map, by name; all have one map, in the frame of the first."""
+    frames: dict[str, Array]
+    """Pose (3,) of each vehicle at the first stamp of its log, the origin of its own frame."""
+    left_out: dict[str, str]
+    """Reason for which each other drive is not in the map, by name."""
+
+
+def solve_together(
+    logs: Mapping[str, Log],
+    make: Callable[[MapperSettings, Log], BatchMapper],
+    settings: MapperSettings | None = None,
+    start: Start | None = None,
+    on_round: Callable[[], None] | None = None,
+) -> JointResult:
+    """Solve one map of several logs by name, in the frame of the first log that is in it.
+
+    `make` makes the mapper that solves each log alone. A log that cannot be solved alone, or whose drive fits
+    nowhere on the map of the others, is left out. SolveError if none is left.
+    """
+    settings = known_settings(settings)
+    scales = {name: log.scale for name, log in logs.items()}
+    if len(set(scales.values())) > 1:
+        raise SettingsError(f"scale: expected logs of one scale, found {scales}")
+    alone, left_out = dict[str, BatchResult](), dict[str, str]()
+    for name, log in logs.items():
+        try:
+            alone[name] = make(settings, log).solve(log, start, on_round)
+        except SolveError as error:
+            left_out[name] = str(error)
+    if not alone:
+        raise SolveError(next(iter(left_out.values())))
+    joint = join(alone, {name: log.source.get("vehicle", "") for name, log in logs.items()}, on_round)
+    return replace(joint, left_out=left_out | joint.left_out)
+
+
+def join(
+    alone: Mapping[str, BatchResult],
+    vehicles: Mapping[str, str] | None = None,
+    on_round: Callable[[], None] | None = None,
+) -> JointResult:
+    """Solve one map of drives that were solved alone, at one scale.
+
+    Drives of one vehicle, if its name is known, share the calibration of the sensor.
+    """
+    scale, watch = next(iter(alone.values())).scale, Stopwatch()
+    with threadpool_limits(limits=1), solving("the joint batch"):
+        placed, left_out = place_all(alone, vehicles or {})
+        watch.lap("place")
+        joint = _Joint(placed, on_round, watch)
+        joint.solve()
+        result = joint.result(scale)
+    return replace(result, left_out=left_out | joint.left_out)
+
+
+def place_all(
+    alone: Mapping[str, BatchResult], vehicles: Mapping[str, str]
+) -> tuple[list[PlacedDrive], dict[str, str]]:
+    """Place drives on the map of the base; return them, and by name why others do not fit."""
+    known = base_of(alone)
+    motions, left_out = {known: np.zeros(3)}, dict[str, str]()
+    for name, one in alone.items():
+        if name == known:
+            continue
+        try:
+            motions[name] = find_place(driven(alone[known]), driven(one))
+        except NotPlacedError as error:
+            left_out[name] = str(error)
+    names = [name for name in alone if name in motions]
+    back = inverse(motions[names[0]])
+    placed = [
+        PlacedDrive(name, alone[name], compose(back, motions[name]), vehicles.get(name, "")) for name in names
+    ]
+    return placed, left_out
+
+
+def base_of(alone: Mapping[str, BatchResult]) -> str:
+    """Name of the drive whose curves are the start: the first closed one, or else the longest."""
+    closed = (name for name, one in alone.items() if one.map.closed)
+    return next(closed, max(alone, key=lambda name: float(path_lengths(alone[name].trajectory)[-1])))
+
+
+def driven(result: BatchResult) -> Driven:
+    return Driven(result.optimum.state, result.system.detections, result.system.settings)
+
+
+class _Joint:
+    """Search for the optimum of all drives; drives that contradict it are left out."""
+
+    def __init__(
+        self, placed: Sequence[PlacedDrive], on_round: Callable[[], None] | None, watch: Stopwatch
+    ) -> None:
+        self.placed, self.left_out = list(placed), dict[str, str]()
+        self._on_round, self._watch = on_round, watch
+
+    def solve(self) -> None:
+        """Search the optimum, again without drives that contradict it."""
+        base = base_of({one.name: one.alone for one in self.placed})
+        self.system = JointSystem(self.placed)
+        state = joint_state(self.system, next(one for one in self.placed if one.name == base))
+        self.system.revisits += tuple(revisits_between(self.system, state))
+        optimizer = Optimizer(self.system, on_round=self._on_round)
+        found = Found(optimizer, *optimizer.find(state))
+        why = {one.name: self.system.disagreement_of(d, found.at.state) for d, one in enumerate(self.placed)}
+        wrong = {name: reason for name, reason in why.items() if reason}
+        if wrong and len(wrong) < len(self.placed):
+            self.left_out |= wrong
+            self.placed = [one for one in self.placed if one.name not in wrong]
+            self.solve()
+            return
+        self.found, self.known = with_wider_priors(found)
+        self._watch.lap("optimum")
+
+    def result(self, scale: float) -> JointResult:
+        """Return the result in metres of the logs, whose scene has a scale."""
+        track = map_of(self.found, self.known, self._orange(), self._watch)
+        drives, frames = dict[str, BatchResult](), dict[str, Array]()
+        for d, one in enumerate(self.placed):
+            drive = result_of(
+                self.found,
+                self.known,
+                track,
+                settings=one.alone.settings,
+                noise=one.alone.noise,
+                chain=one.chain,
+                seconds=self._watch.laps,
+                drive=d,
+            )
+            drives[one.name] = scaled(drive, scale)
+            frames[one.name] = frame_of(one.chain, drive.trajectory) * [scale, scale, 1.0]
+        return JointResult(drives, frames, {})
+
+    def _orange(self) -> dict[int, PointBoundary]:
+        """Return the orange cones of the first drive that has some of a label, by label."""
+        found = dict[int, PointBoundary]()
+        for one in self.placed:
+            own = scaled(one.alone.map, 1.0 / one.alone.scale).moved(one.motion).points
+            found = {**own, **found}
+        return found

@@ -17,7 +17,7 @@ from pathspace_graph.front_end.front_end import JudgedLog, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
-from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.graph.variables import (
     Layout,
     are_poses,
@@ -37,7 +37,7 @@ from pathspace_graph.run import Stopwatch, settings_dict, solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .gtsam_graph import nonlinear_graph
-from .objections import evidence_against, unmapped
+from .lap import evidence_against, unmapped
 from .optimizer import Convergence, Optimizer
 from .simplification import Scatter, Simplified, map_block, own_settings, simplified
 from .start import CurveMapper, find_revisits, start_odometry, start_online
@@ -195,7 +195,7 @@ class BatchMapper:
             raise SettingsError("start online: expected an online mapper, found none")
         watch.lap("optimum")
         mapper = self.online(settings, noise)
-        state, online = start_online(log, mapper)
+        state, online = start_online(log, mapper, judged.settings)
         watch.lap("start")
         found = None
         if start == "auto" and not revisits:

@@ -5,7 +5,7 @@ cones beside lap 1.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, Protocol
 
@@ -13,11 +13,11 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.se2 import path_lengths, relative, rotated, to_map, wrap_angle
+from pathspace_graph.factors.se2 import difference, path_lengths, relative, rotated, to_map
 from pathspace_graph.front_end.front_end import JudgedLog
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import Elimination, linear_graph
-from pathspace_graph.graph.relative import Revisit, revisit_rows
+from pathspace_graph.graph.rows import Revisit, revisit_rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult, VehicleState
@@ -37,6 +37,7 @@ from pathspace_graph.places.passes import (
 from pathspace_graph.run import OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.bspline import BSpline
 
 from .association import ROW_CONES, add_drive, cluster
 from .simplification import boundary_of, exact_settings, fit_through
@@ -65,19 +66,41 @@ class CurveMapper(OnlineEstimator, Protocol):
     def vehicle_state(self) -> VehicleState: ...
 
 
-def start_online(log: Log, mapper: CurveMapper) -> tuple[State, RunResult]:
+@dataclass(frozen=True, eq=False)
+class StartMap:
+    """A map from which a batch starts, and the poses beside it."""
+
+    splines: dict[int, BSpline]  # curves by label, map frame
+    poses: Array  # (P, 3) poses of all cycles, map frame
+    calibration: Array  # (2,) or (7,) calibration of the odometry, and of the sensor if estimated
+    ends: dict[int, float] = field(default_factory=dict)  # confirmed ends of open curves (m)
+
+    @property
+    def is_open(self) -> bool:
+        return not any(spline.periodic for spline in self.splines.values())
+
+    def state(self, settings: MapperSettings) -> State:
+        """Build the initial state from the map and the poses."""
+        state = State()
+        for label, spline in self.splines.items():
+            own = replace(exact_settings(settings.spline), degree=spline.degree)
+            boundary = Boundary(spline.knots, spline.periodic, own, settings.gauge)
+            boundary.confirmed_end = self.ends.get(label, boundary.tables.high)
+            state.add_boundary(label, boundary, spline.distinct_control_points)
+        add_drive(state, self.poses, self.calibration)
+        return state
+
+
+def start_online(log: Log, mapper: CurveMapper, settings: MapperSettings) -> tuple[State, RunResult]:
     """Run an online estimator; return its final map with all of its poses, and the run."""
-    run, state = run_online(log, mapper, outlines=True), State()
-    for label, known in mapper.boundaries.items():
-        boundary = Boundary(known.knots, known.periodic, exact_settings(known.settings), known.gauge)
-        boundary.confirmed_end = known.confirmed_end
-        state.add_boundary(label, boundary, mapper.control_points(label))
+    run, curves = run_online(log, mapper, outlines=True), mapper.boundaries.items()
+    splines = {label: boundary.spline(mapper.control_points(label).copy()) for label, boundary in curves}
+    ends = {label: boundary.confirmed_end for label, boundary in curves}
     corrected = mapper.corrected_poses
     poses = unwrap(np.concatenate([corrected, run.trajectory[len(corrected) :]]))
     vehicle = mapper.vehicle_state()
     calibration = np.concatenate([vehicle.calibration, vehicle.sensor])
-    add_drive(state, poses, calibration)
-    return state, run
+    return StartMap(splines, poses, calibration, ends).state(settings), run
 
 
 def unwrap(poses: Array) -> Array:
@@ -209,8 +232,7 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
 
 def _is_off(revisit: Revisit, poses: Array) -> bool:
     """Whether poses (P, 3) contradict a revisit too much for the search of the next one."""
-    off = relative(poses[revisit.earlier], poses[revisit.later]) - revisit.local
-    off[2] = wrap_angle(off[2])
+    off = difference(relative(poses[revisit.earlier], poses[revisit.later]), revisit.local)
     return float(np.square(off / NEARBY[0]).sum()) > OFF**2
 
 

@@ -12,8 +12,7 @@ from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
-from pathspace_graph.graph.relative import Revisit, revisit_rows
-from pathspace_graph.graph.rows import Rows, at_values, by_widths
+from pathspace_graph.graph.rows import Revisit, Rows, at_values, by_widths, revisit_rows
 from pathspace_graph.graph.variables import POINT, Layout, are_poses, pose_keys
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.detection_rows import NO_ROWS, DetectionRows, rows_across
@@ -21,8 +20,7 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .association import headings
-from .stations import StationMatches, match_stations
+from .association import StationMatches, headings, match_stations
 
 LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
 SETTLE_FEET: Final = 16  # largest number of refinements of the foot points before a step

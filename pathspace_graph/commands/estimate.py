@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pathspace_graph import estimators
-from pathspace_graph.batch.joint_mapper import JointResult, solve_together
+from pathspace_graph.batch.joint import JointResult, solve_together
 from pathspace_graph.batch.known_map import map_of_cones
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.console import note, output, progress, say
@@ -43,7 +43,7 @@ from pathspace_graph.run import Observer, OnlineEstimator, run_online, with_own
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import EVENTS
 from pathspace_graph.sim.track_files import read_track
-from pathspace_graph.spline.crossing import crossings_told
+from pathspace_graph.spline.boundary import crossings_told
 
 from .outcome import Outcome
 

@@ -17,7 +17,7 @@ from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FI
 from pathspace_graph.io.tables import read_table, read_trajectory
 from pathspace_graph.options.map import Export
 from pathspace_graph.spline.ahead import LEAST_STEP, MOST_POINTS
-from pathspace_graph.spline.crossing import crossed_boundaries, crossings_told
+from pathspace_graph.spline.boundary import crossed_boundaries, crossings_told
 
 from .outcome import Outcome
 

@@ -18,11 +18,11 @@ from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
-from .line_matching import merged
 from .log_odometry import LogOdometry, chained
 from .measurement import odometry_noise
 from .motion import MotionCheck
 from .noise import NoiseLearner, measure_noise
+from .scan_matching import merged
 from .sides import SideJudge
 from .sightings import SeenCycle, TwistRecord
 

@@ -21,7 +21,7 @@ from pathspace_graph.factors.arrays import Array, IntArray
 
 from .gaussian import cholesky, factors_of, graph_of, keys_of, normal_equations, require_keys, solve
 from .rows import Rows, jacobian_factors
-from .variables import POSE, Layout, Variables, are_poses, sizes
+from .variables import POSE, Layout, Variables, are_poses, indices, pose_keys, sizes
 
 POSES_IN_FACTOR: Final = 8
 """Few factors are cheap to create, narrow ones to eliminate; 5 to 10 poses take alike. All rows of a graph
@@ -172,6 +172,23 @@ def eliminated_system(graph: gtsam.GaussianFactorGraph, kept: Layout) -> tuple[A
     """Return H (n, n) and g (n,) on a layout, all others eliminated. Raises as `Elimination` does."""
     _, remaining = _eliminated(graph, kept, len(keys_of(graph)) - len(kept.keys))
     return normal_equations(remaining, kept)
+
+
+def marginal_before(groups: Sequence[Rows], variables: Variables, first: int) -> tuple[Layout, Array, Array]:
+    """Return what poses before the cycle `first` say: H (n, n) and g (n,) on [calibrations | map | its pose].
+
+    It has all rows with an earlier pose or without a pose, and no others, on the variables of the map that
+    they hold. The unknowns are the changes from the variables' values.
+    """
+    before = list[Rows]()
+    for rows in groups:
+        if len(rows):
+            poses = are_poses(rows.keys)
+            kept = (poses & (indices(rows.keys) < first)).any(axis=1) | ~poses.any(axis=1)
+            before.append(rows.where(np.flatnonzero(kept)))
+    held = np.unique(np.concatenate([rows.keys.ravel() for rows in before]))
+    layout = Layout(np.append(held[~are_poses(held)], pose_keys(np.array([first]))))
+    return layout, *eliminated_system(linear_graph(before, variables), layout)
 
 
 def _eliminated(

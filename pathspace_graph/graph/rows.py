@@ -16,11 +16,12 @@ import numpy as np
 
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors import _kernels as kernels
+from pathspace_graph.factors import se2
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.linear import keys_of_factor
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
-from pathspace_graph.factors.se2 import compose, rotation
+from pathspace_graph.factors.se2 import compose, left_of, rotation, to_vehicle, wrap_angle
 
 from .gaussian import FactoredSystem, factors_of, half_solve
 from .variables import (
@@ -265,3 +266,45 @@ def predicted_covariance(
     half = half_solve(step.factor, gradient).T.reshape(-1, together, step.layout.size)
     own = noise.reshape(-1, together, POSE)
     return np.asarray(half @ half.transpose(0, 2, 1) + own @ own.transpose(0, 2, 1))
+
+
+# --- a place that was met again --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Revisit:
+    """The pose of one cycle in the frame of an earlier one's, by cones seen from both: `A (y(x) - y0)`.
+
+    Where a drive meets its road again without a lap, as on a skidpad, a pose may slide along both boundaries,
+    but the cones themselves hold it in every direction.
+    """
+
+    earlier: int  # cycle in whose frame the pose is
+    later: int
+    local: Array  # (3,) the measured pose y0 (m, m, rad)
+    root: Array  # (3, 3) A, a square root of its information
+
+
+def revisit_rows(revisits: Sequence[Revisit], poses: Array) -> list[Rows]:
+    """Return the rows on [earlier pose | later pose], linearized at the poses (P, 3) of all cycles.
+
+    They are one group, or none without revisits. Those of one later pose are a factor of their own, since the
+    earlier one is far away.
+    """
+    if not revisits:
+        return []
+    ends = np.array([(one.earlier, one.later) for one in revisits])
+    frame, other = poses[ends.T]
+    turn, moved = se2.rotations(frame[:, 2]), other - frame
+    off = np.column_stack([(moved[:, None, :2] @ turn)[:, 0], moved[:, 2]])
+    off -= [one.local for one in revisits]
+    off[:, 2] = wrap_angle(off[:, 2])
+    by_other = np.tile(np.eye(POSE), (len(ends), 1, 1))
+    by_other[:, :2, :2] = turn.transpose(0, 2, 1)
+    by_frame = -by_other
+    by_frame[:, :2, 2] = -left_of(to_vehicle(other[:, :2], frame))
+    by_ends = np.concatenate([by_frame, by_other], axis=2)
+    jacobian = np.concatenate([one.root @ by for one, by in zip(revisits, by_ends, strict=True)])
+    residual = np.concatenate([one.root @ own for one, own in zip(revisits, off, strict=True)])
+    keys, owner = np.repeat(pose_keys(ends), POSE, axis=0), np.repeat(-1 - ends[:, 1], POSE)
+    return [Rows(keys, jacobian, residual, owner)]

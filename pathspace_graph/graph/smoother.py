@@ -28,15 +28,15 @@ from .gaussian import (
     factorize,
     graph_of,
     marginalize,
+    merge_variables,
     remove_information,
     solve,
     sparse_marginal,
 )
 from .inactive import Attached, InactiveChain, InactiveMap
-from .relative import Submaps
 from .rows import Rows, calibrated_delta, newton_system, predicted_covariance
 from .variables import CALIBRATION_KEY, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys, sizes
-from .window import M_co, SmootherSettings, UserFactors, WindowFactors, check_factors, values_of
+from .window import M_co, MapRows, SmootherSettings, UserFactors, WindowFactors, check_factors, values_of
 
 NO_INFORMATION: Final = 1e-10  # a factor that removes less of a variance than this share says nothing
 TIME_TOLERANCE: Final = 1e-9  # by which a pose must be older than the lag (s), since stamps have round-off
@@ -52,8 +52,6 @@ class FixedLagSmoother(Generic[M_co]):
         self.user_factors = UserFactors()
         self.inactive: InactiveMap = InactiveChain()  # variables that a cycle does not solve for
         self.attached: list[Attached] = []  # what moves with the open map
-        self.submaps: Submaps | None = None
-        """The prior in submaps, while the loop is open and the user gave no factors on poses."""
         self.last_step: FactoredSystem | None = None  # damped system of the last Gauss-Newton step
         self.held: HeldMap | None = None  # what was known of a closed map when its gauge was held
         sigmas = np.array(settings.sigmas_calibrations)
@@ -73,7 +71,6 @@ class FixedLagSmoother(Generic[M_co]):
         other.window.map, other.window.variables = other.map, other.variables
         other.user_factors = shallow(self.user_factors)
         other.inactive = self.inactive.copy()
-        other.submaps = self.submaps and self.submaps.copy()
         return other
 
     @property
@@ -83,11 +80,6 @@ class FixedLagSmoother(Generic[M_co]):
     @property
     def next_cycle(self) -> int:
         return self.first_cycle + len(self.times)
-
-    @property
-    def keyframe_cycles(self) -> list[int]:
-        """Return the cycles of the poses in whose frames the submaps are."""
-        return [key - pose_key(0) for key in self.submaps.keyframes] if self.submaps is not None else []
 
     @property
     def cycles(self) -> IntArray:
@@ -127,7 +119,6 @@ class FixedLagSmoother(Generic[M_co]):
         self.variables.insert(pose_keys(np.array([self.next_cycle])), pose)
         self.add_pose_prior(self.next_cycle, covariance)
         self.times.append(t)
-        self.submaps = Submaps(graph_of(self.prior), self.settings.keyframe_interval)
 
     def add_pose(self, t: float, pose: Array, odometry: IntegratedOdometry) -> None:
         """Add the next pose (3,) at t (s), and the odometry that leads to it."""
@@ -169,16 +160,14 @@ class FixedLagSmoother(Generic[M_co]):
     def add_factors(self, factors: Sequence[gtsam.NonlinearFactor]) -> bool:
         """Add the user's factors on any variables, and on the pose of the next cycle, after their check.
 
-        Factors on poses may be absolute, which a submap cannot be: submaps are dropped then, and the prior
-        keeps its linearization point when the loop closes. Inactive variables of a factor become active.
-        Return whether submaps were dropped, or an open map got a frame of its own.
+        They may be absolute, so an open map gets a frame of its own. Inactive variables of a factor become
+        active. Return whether the map was without such a frame.
         """
-        had_submaps, had_chain = self.submaps is not None, self.chain is not None
-        if self.user_factors.add(factors):
-            self.submaps = None
-        if self.chain is not None or np.isin(self.user_factors.keys, self.inactive.keys).any():
+        had_chain = self.chain is not None
+        self.user_factors.add(factors)
+        if had_chain or np.isin(self.user_factors.keys, self.inactive.keys).any():
             self.reactivate()
-        return (had_submaps and self.submaps is None) or (had_chain and self.chain is None)
+        return had_chain
 
     def set_calibration_priors(self, mean: Array, sigma: Array) -> None:
         """Give the priors of the calibrations other means and standard deviations, (2,) or (7,).
@@ -190,17 +179,13 @@ class FixedLagSmoother(Generic[M_co]):
             return
         self.calibration_prior = mean, sigma
         negative = [factor.negate() for factor in calibration_factors(self.variables, *before)]
-        self._add_to_prior(*calibration_factors(self.variables, mean, sigma), *negative)
+        self.prior = graph_of(self.prior, *calibration_factors(self.variables, mean, sigma), *negative)
 
     def measure_bias(self, value: float, sigma: float) -> None:
         """Add a measurement of the yaw rate's bias (rad/s), which a vehicle at rest makes."""
         keys, row = np.array([CALIBRATION_KEY]), np.array([[0.0, 1.0 / sigma]])
-        self._add_to_prior(absolute_factor(keys, row, self.variables, np.array([0.0, value])))
-
-    def _add_to_prior(self, *factors: gtsam.GaussianFactor) -> None:
-        self.prior = graph_of(self.prior, *factors)
-        if self.submaps is not None:
-            self.submaps.first = graph_of(self.submaps.first, *factors)
+        measured = absolute_factor(keys, row, self.variables, np.array([0.0, value]))
+        self.prior = graph_of(self.prior, measured)
 
     # --- update: Gauss-Newton ----------------------------------------------------------------------------
 
@@ -303,8 +288,6 @@ class FixedLagSmoother(Generic[M_co]):
         cycle, key = self.first_cycle, pose_key(self.first_cycle)
         user = self.user_factors.remove(np.array([key]), self.variables)
         factors = graph_of(self.window.pop(cycle), *user)
-        if self.submaps is not None:
-            self.submaps.add_pose(key, factors, self.variables)
         self.prior = graph_of(self.prior, factors)
         self.variables.first_cycle += 1
         if key not in self.inactive.anchors:
@@ -325,7 +308,6 @@ class FixedLagSmoother(Generic[M_co]):
         shared = [*self.window.weak_on(keys), *self.user_factors.deactivate(keys, self.variables)]
         user = self.user_factors.remove(keys, self.variables)
         keyframes = self.variables.keyframes
-        self._finish_submap()
         if self.chain is not None:
             self.prior = self.chain.attach(self.prior, keys, shared, self.variables)
         else:
@@ -333,20 +315,11 @@ class FixedLagSmoother(Generic[M_co]):
         self.variables.remove(keyframes)
         self.window.drop(self.inactive.keys)  # a factor linearized earlier may still hold one of them
 
-    def _finish_submap(self) -> None:
-        """Finish the current submap, so that it stays small when other map points become active."""
-        if self.submaps is not None:
-            self.submaps.finish(self.variables)
-            if self.chain is not None and len(self.chain):
-                anchor = int(self.chain.anchors[0])
-                self.submaps.attach(anchor, self.variables.of(self.chain.anchors))
-
     def transform_to_origin(self) -> None:
         """Update the inactive variables, and move an open map so that the drive began at the origin."""
         if self.chain is None or len(self.chain) == 0:
             self.refresh()
             return
-        self._finish_submap()
         self.prior = self.chain.transform_to_origin(self.prior, self.variables, self.attached)
         self.window.relinearize(self.cycles, self.inactive.keys)
 
@@ -360,23 +333,18 @@ class FixedLagSmoother(Generic[M_co]):
             return
         if not self.chain.holds(keys):
             return
-        self._finish_submap()
         self.refresh()
-        self._place_keyframes(self.chain)
         while self.chain.holds(keys):
             back = self.chain.newest
             self.prior = graph_of(as_rows(graph_of(self.prior, self.chain.detach(self.variables))))
             self.map.activate(back)
 
     def reactivate(self, with_prior: bool = True) -> None:
-        """Make all variables active, with their prior, or with none that submaps or a marginal replace."""
+        """Make all variables active, with their prior, or with none that a marginal replaces."""
         chain = self.chain
         if chain is None and len(self.inactive) == 0:
             return
         self.transform_to_origin()
-        self._finish_submap()
-        if chain is not None:
-            self._place_keyframes(chain)
         if not with_prior:
             self.prior = gtsam.GaussianFactorGraph()
             self.variables.remove(self.variables.keyframes)
@@ -390,12 +358,6 @@ class FixedLagSmoother(Generic[M_co]):
             self.marginalize_keyframes()
         self.map.activate_all()
 
-    def _place_keyframes(self, chain: InactiveChain) -> None:
-        if self.submaps is not None:
-            anchors = np.union1d(chain.anchors, self.variables.keyframes)
-            active = {int(key): self.variables.of(np.array([key])) for key in anchors}
-            self.submaps.place_attached(chain.poses | active)
-
     def marginalize_keyframes(self) -> None:
         """Marginalize the poses that are older than the window."""
         keyframes = self.variables.keyframes
@@ -407,5 +369,102 @@ class FixedLagSmoother(Generic[M_co]):
         self.activate(keys)
         now = self.variables.change(self.variables.layout.entries(keys))
         self.prior = remove_information(self.prior, Layout(keys), now)
-        if self.submaps is not None:
-            self.submaps.remove_information(keys, self.variables)
+
+
+Smoother = FixedLagSmoother[MapRows]
+
+STIFFNESS: Final = 1e4  # information about a gauge that is held, by that from measurements
+
+
+# --- other map points ------------------------------------------------------------------------------------
+
+
+def merge_points(smoother: Smoother, removed: IntArray, kept: IntArray) -> None:
+    """Merge map points `removed` (k,) into points `kept` (k,), which keep their values.
+
+    The map's rows must be on the kept keys afterwards.
+    """
+    variables, user = smoother.variables, smoother.user_factors.remove(removed, smoother.variables)
+    reference, layout = variables.reference, variables.layout
+    offset = reference[layout.entries(kept)] - reference[layout.entries(removed)]
+    smoother.prior = merge_variables(graph_of(smoother.prior, *user), removed, kept, offset)
+    variables.remove(removed)
+    smoother.window.clear()
+
+
+def place_again(smoother: Smoother, keys: IntArray, points: Array, sigma: float) -> None:
+    """Move map points (k,) of a closed map to `points` (k, 2), and forget what was known of them.
+
+    They have a prior with a standard deviation sigma (m) about their new places.
+    """
+    smoother.remove_information(keys)
+    variables = smoother.variables
+    variables.values[variables.layout.entries(keys)] = points.ravel()
+    root = np.eye(points.size) / sigma
+    smoother.prior = graph_of(smoother.prior, absolute_factor(keys, root, variables))
+    smoother.window.clear()
+
+
+# --- another prior ---------------------------------------------------------------------------------------
+
+
+def hold_motion(smoother: Smoother, keys: IntArray, across: Array) -> None:
+    """Hold where a closed map as a whole is, and go on to estimate its shape.
+
+    The rows C `across` (3, 2k) give the rigid motion (x, y, theta) by `C dx`, for moves dx of the points
+    (k,), ascending.
+    """
+    smoother.reactivate()
+    known = smoother.covariance(keys)
+    information = STIFFNESS * np.linalg.inv(across @ known @ across.T)
+    root = np.linalg.cholesky(information).T @ across
+    smoother.prior = graph_of(smoother.prior, absolute_factor(keys, root, smoother.variables))
+    smoother.held = HeldMap(keys, known)
+
+
+def forget_poses(smoother: Smoother, first_cycle: int) -> None:
+    """Remove the poses before `first_cycle`, and all prior information about where the poses are.
+
+    The later poses keep their odometry, and one of them must be given a prior by `add_pose_prior`.
+    """
+    smoother.reactivate()
+    leaving = pose_keys(np.arange(smoother.first_cycle, first_cycle))
+    user = smoother.user_factors.remove(leaving, smoother.variables)
+    smoother.prior = marginalize(graph_of(smoother.prior, *user), pose_keys(smoother.cycles))
+    _drop_before(smoother, first_cycle)
+
+
+def restart(smoother: Smoother, first_cycle: int, removed: IntArray, added: IntArray, points: Array) -> None:
+    """Replace map points `removed` (n,) by `added` (k,) at `points` (k, 2), and drop the prior.
+
+    Poses before `first_cycle` leave the window. A new prior must be set, on all that remains.
+    """
+    smoother.inactive = InactiveMap()
+    smoother.held, smoother.prior = None, gtsam.GaussianFactorGraph()
+    smoother.variables.remove(np.append(smoother.variables.keyframes, removed))
+    _drop_before(smoother, first_cycle)
+    smoother.variables.insert(added, points.ravel())
+
+
+def _drop_before(smoother: Smoother, first_cycle: int) -> None:
+    """Remove the poses before a cycle, and all factors of the window."""
+    leaving = np.arange(smoother.first_cycle, first_cycle)
+    smoother.user_factors.remove(pose_keys(leaving), smoother.variables)
+    for cycle in leaving.tolist():
+        smoother.drop_oldest(cycle)
+    smoother.variables.first_cycle = first_cycle
+    smoother.variables.remove(pose_keys(leaving))
+    smoother.window.clear()
+
+
+def set_prior(smoother: Smoother, keys: IntArray, mean: Array, information: Array) -> None:
+    """Set the prior to a Gaussian of ascending keys (k,), with mean (n,) and information (n, n)."""
+    root = np.asarray(np.linalg.cholesky(information).T, np.float64)
+    prior = absolute_factor(keys, root, smoother.variables, mean)
+    smoother.prior = graph_of(gtsam.HessianFactor(graph_of(prior)))
+
+
+def exchange_calibration_priors(smoother: Smoother, included: tuple[Array, Array]) -> None:
+    """Exchange the calibrations' priors that a new prior includes for those that the smoother has now."""
+    present, smoother.calibration_prior = smoother.calibration_prior, included
+    smoother.set_calibration_priors(*present)

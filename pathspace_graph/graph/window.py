@@ -45,7 +45,6 @@ class SmootherSettings:
     lag: float  # time (s) for which poses stay in the window
     tolerances: tuple[float, float]
     """Motion of a point or position (m), and of a heading (rad), beyond which rows are linearized again."""
-    keyframe_interval: float  # length of path (m) between the keyframes of the submaps
     sigmas_calibrations: tuple[float, ...]
     """Prior standard deviations of the calibrations: scale error (-) and yaw-rate bias (rad/s) of the
     odometry, and five of the sensor where they are estimated."""
@@ -234,11 +233,10 @@ class UserFactors:
         self._inactive: list[gtsam.NonlinearFactor] = []
         self.given = False  # whether the user has ever given a factor, which may be absolute
 
-    def add(self, factors: Sequence[gtsam.NonlinearFactor]) -> bool:
-        """Add factors that `check_factors` lets pass, and return whether any of them holds a pose."""
+    def add(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
+        """Add factors that `check_factors` lets pass."""
         self.factors = [*self.factors, *factors]
         self.given |= len(factors) > 0
-        return any(map(_holds_pose, factors))
 
     @property
     def keys(self) -> IntArray:

@@ -9,9 +9,9 @@ from pathspace_graph.batch.association import POSE_STEP, headings, locate_poses
 from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose, left_of, relative
-from pathspace_graph.graph.changes import hold_motion, restart, set_prior
-from pathspace_graph.graph.variables import control_keys, pose_keys
+from pathspace_graph.factors.se2 import compose, inverse, left_of, move_points, relative
+from pathspace_graph.graph.smoother import exchange_calibration_priors, hold_motion, restart, set_prior
+from pathspace_graph.graph.variables import NO_KEYS, control_keys, pose_keys
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
@@ -30,29 +30,47 @@ SIGMA_STEP: Final = 10.0  # damping of control points while the loop is optimize
 # --- the marginal of the open lap's batch ----------------------------------------------------------------
 
 
-def swap_in(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
-    """Replace curves and prior by the marginal of a lap; return the jump (3,) of the newest pose.
+def swap_in(road: Road, marginal: LapMarginal) -> Array:
+    """Replace curves and prior by the marginal of a batch; return the jump (3,) of the newest pose.
 
     The window keeps its own factors of the poses from `first_kept` on, and the marginal has those of all
-    earlier poses, so nothing is counted twice. The marginal includes the priors of spacing and shape. Poses
-    after the last one of the lap move rigidly with it.
+    earlier poses, so nothing is counted twice. The marginal includes the priors of spacing and shape. What
+    came after the batch's last pose moves rigidly with it: poses, and the newest ends of open curves.
     """
-    state, settings, first = smoother.map.state, smoother.map.settings, marginal.first_kept
+    smoother, state, first = road.smoother, road.smoother.map.state, marginal.first_kept
     smoother.reactivate(with_prior=False)
-    before, removed = state.poses[-1].copy(), state.map_keys
-    for label, spline in marginal.splines.items():
-        state.close(label, state.boundaries[label].closed(spline.knots))
-    added = np.concatenate([state.keys(label) for label in marginal.splines])
-    points = np.concatenate([spline.distinct_control_points for spline in marginal.splines.values()])
-    restart(smoother, first, removed, added, points)
-    smoother.map.replaced_by(marginal.scatter, marginal.cones, marginal.stations)
+    before = state.poses[-1].copy()
+    if marginal.closed:
+        removed = state.map_keys
+        for label, spline in marginal.splines.items():
+            state.close(label, state.boundaries[label].closed(spline.knots))
+        added = np.concatenate([state.keys(label) for label in marginal.splines])
+        points = np.concatenate([spline.distinct_control_points for spline in marginal.splines.values()])
+        restart(smoother, first, removed, added, points)
+        smoother.map.replaced_by(marginal.scatter, marginal.cones, marginal.stations)
+    else:
+        restart(smoother, first, NO_KEYS, NO_KEYS, np.zeros((0, 2)))
     _move_poses(state.poses, marginal.poses[first:])
+    motion = compose(state.poses[-1], inverse(before))
+    if not marginal.closed:
+        road.move(motion)
+        for label, spline in marginal.splines.items():
+            control_points, boundary = state.control_points(label), state.boundaries[label]
+            end, placed = marginal.ends[label], spline.size
+            if boundary.confirmed_end > end:  # growth has placed the last ones again
+                placed = boundary.settled(spline.size, boundary.last_cone(end))
+            control_points[placed:] = move_points(motion, control_points[placed:])
+            control_points[:placed] = spline.control_points[:placed]
+    known = [state.keys(label)[: spline.size] for label, spline in marginal.splines.items()]
     state.variables.calibrations[:] = marginal.calibration
-    locate_poses(state)
-    keys = np.concatenate([state.variables.calibration_keys, added, pose_keys(np.array([first]))])
+    keys = np.concatenate([state.variables.calibration_keys, *known, pose_keys(np.array([first]))])
     set_prior(smoother, keys, marginal.mean, marginal.information)
-    smoother.reassociate()
-    for _ in range(settings.closing.iterations):
+    if marginal.closed:
+        locate_poses(state)
+        smoother.reassociate()
+    else:
+        exchange_calibration_priors(smoother, marginal.calibration_prior)
+    for _ in range(road.settings.closing.iterations):
         smoother.step(SIGMA_STEP)
     return np.asarray(state.poses[-1] - before)
 

@@ -12,9 +12,9 @@ import numpy as np
 from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose, inverse, path_lengths, wrap_angle
+from pathspace_graph.factors.se2 import compose, difference, inverse, path_lengths
 from pathspace_graph.front_end.front_end import Reading
-from pathspace_graph.graph.changes import forget_poses
+from pathspace_graph.graph.smoother import forget_poses
 from pathspace_graph.health import DEGRADED, Health
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.detections import DetectionColumns
@@ -130,8 +130,7 @@ def restart_window(smoother: CurveSmoother, first_cycle: int, place: Place) -> A
     smoother.reassociate()
     for _ in range(RESTART_STEPS):
         smoother.step(settings.sigma_step)
-    jump = state.poses[-1] - before
-    return np.append(jump[:2], wrap_angle(jump[2]))
+    return difference(state.poses[-1], before)
 
 
 def widened(place: Place) -> Array:

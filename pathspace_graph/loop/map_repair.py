@@ -12,12 +12,13 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from pathspace_graph.batch.lap import ClosedMap, LapMarginal
+from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.batch.simplification import fit_through
+from pathspace_graph.batch.start import StartMap
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
-from pathspace_graph.graph.changes import place_again
+from pathspace_graph.graph.smoother import place_again
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import along_and_across
@@ -149,7 +150,7 @@ class MapRepair(Copyable):
             self._attempts, self._wait_until = self._attempts + 1, driven + longest
         return bool(self._stretches)
 
-    def begin(self, smoother: CurveSmoother, poses: Array) -> ClosedMap:
+    def begin(self, smoother: CurveSmoother, poses: Array) -> StartMap:
         """Return the initial map of the batch, with the poses (P, 3) of all cycles."""
         smoother.refresh()
         track, state = smoother.map, smoother.map.state
@@ -157,7 +158,7 @@ class MapRepair(Copyable):
         self._lap = poses[lap_begin(poses, longest) :]
         self._mapped = {label: mapped_cones(track, label) for label in state.boundaries}
         splines = {label: refitted(track, label, self._stretches, poses) for label in state.boundaries}
-        return ClosedMap(splines, poses, state.variables.calibrations.copy())
+        return StartMap(splines, poses, state.variables.calibrations.copy())
 
     def in_place(self, smoother: CurveSmoother) -> str:
         """Refit the curves of a known map through the contradicting cones; return the notice.

@@ -1,24 +1,34 @@
-"""The open road: its map grows until a return to its beginning starts the batch that closes the loop."""
+"""The open road: its map grows, and where road is driven again, a batch of the drive replaces it."""
 
 from dataclasses import replace
+from math import inf
 from typing import ClassVar, Final
 
+import numpy as np
+
 from pathspace_graph.batch.association import LINE_STEP
+from pathspace_graph.batch.start import REVISIT_INTERVAL, StartMap, unwrap
+from pathspace_graph.copies import Copyable
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import path_lengths, to_vehicle
 from pathspace_graph.front_end.front_end import Reading
-from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.front_end.noise import NoiseLearner
+from pathspace_graph.graph.rows import Revisit
+from pathspace_graph.mapping.path import HEADING
 from pathspace_graph.mapping.road import Road
+from pathspace_graph.places.constellation import Prior, SampledCurves
+from pathspace_graph.places.passes import NEARBY, newest_place, return_to_beginning, revisit_of
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .closed import Closed
-from .drive import Drive, Phase, Step
+from .drive import Drive, DriveRecord, Phase, Step
 from .lap_solver import Outcome
-from .returns import ReturnFinder
-from .revisit import Revisits
 from .worker import Unsolved
 
 STAYS_OPEN: Final = "the loop stays open"  # beginning of the notice without a batch that agrees
 REVISITED: Final = "the road was driven before: the open map was optimized with the earlier pass"
 """Notice of the first cycle with a revisit."""
+NOT_REVISITED: Final = "an earlier pass of the road is not used"  # beginning of the notice of a failed batch
 
 
 class Open(Phase):
@@ -30,11 +40,13 @@ class Open(Phase):
         self.settings = settings
         self.returns = ReturnFinder(settings)
         self.revisits = Revisits(settings)
-        self.returned_by: Revisit | None = None  # relative pose that started the newest batch
+        self.asked_by: Revisit | None = None  # relative pose that started the newest batch
+        self._closes = False  # whether that batch is to close the loop
+        self._taken_back = 0  # how often curves had been taken back before
         self._said = False  # whether a notice has said why there is no batch
 
     def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        """Search for a return, which starts a batch; apply the batch's result, or a revisit."""
+        """Search for road that is driven again, which starts a batch; apply the batch's result."""
         learned = drive.inflate_priors(road, reading)
         drive.record.estimated(road)
         step = Step(self) if drive.rests(road) else self._step(road, drive, reading, spent)
@@ -45,28 +57,30 @@ class Open(Phase):
             if not self._is_solvable(road, drive):
                 return self._stay_open(drive)
             self._begin_batch(road, drive, reading)
-        if drive.solver.is_busy:
-            outcome = drive.outcome(road, spent)
-            return Step(self) if outcome is None else self.take(road, drive, outcome)
-        revisit = self.revisits.find(road, drive.record, reading.noise)
-        if revisit is None:
+        if not drive.solver.is_busy:
             return Step(self)
-        notice = "" if drive.revisits else REVISITED  # only the first time
-        return Step(self, drive.lay_on(road, revisit), notice)
+        outcome = drive.outcome(road, spent)
+        return Step(self) if outcome is None else self.take(road, drive, outcome)
 
     def _begin_batch(self, road: Road, drive: Drive, reading: Reading) -> None:
-        """Start a batch of the lap if the newest detections match those of its beginning.
+        """Start a batch if the newest detections match those of the beginning, or of another earlier pass.
 
-        The map stays open until the batch confirms the match.
+        The map stays as it is until the batch confirms the match.
         """
-        if road.path.length <= self.settings.closing.min_path:
-            return
-        drive.solver.prepare()
-        revisit = self.returns.find(road, drive.record, reading.noise)
-        if revisit is not None:
+        revisit, record, noise = None, drive.record, reading.noise
+        if road.path.length > self.settings.closing.min_path:
+            drive.solver.prepare()
+            revisit = self.returns.find(road, record, noise)
+        self._closes, start = revisit is not None, None
+        if revisit is None:
+            revisit = self.revisits.find(road, record, noise)
+            if revisit is None:
+                return
+            start = open_map(road, record.with_window(road))
+        else:
             self.returns.rest(road, self.settings.open_lap.retry)
-            self.returned_by = revisit
-            drive.begin_batch(road, reading, revisit)
+        self.asked_by, self._taken_back = revisit, road.growth.taken_back
+        drive.begin_batch(road, reading, start, (revisit, *drive.revisits))
 
     def _is_solvable(self, road: Road, drive: Drive) -> bool:
         """Whether a batch can solve the lap; one with too many cones is given up."""
@@ -83,14 +97,140 @@ class Open(Phase):
         said, self._said = self._said, True
         return Step(self, notice="" if said else f"{STAYS_OPEN}: {drive.record.unsolvable}")
 
-    # --- closing -----------------------------------------------------------------------------------------
+    # --- results -----------------------------------------------------------------------------------------
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
-        """Close the loop by a batch that confirms it; otherwise the notice says why it stays open."""
+        """Close the loop, or replace the open map, by a batch that confirms the match.
+
+        Otherwise the notice says why not. A curve that was taken back meanwhile is not that of the batch.
+        """
+        failed = STAYS_OPEN if self._closes else NOT_REVISITED
         if isinstance(outcome, Unsolved):
-            return Step(self, notice=f"{STAYS_OPEN}: {outcome.reason}")
+            return Step(self, notice=f"{failed}: {outcome.reason}")
         if outcome.objection:
-            return Step(self, notice=f"{STAYS_OPEN}: {outcome.objection}")
-        road.smoother.settle()
-        jump = drive.close(road, outcome, self.returned_by)
-        return Step(self.CLOSED(road, drive), jump)
+            return Step(self, notice=f"{failed}: {outcome.objection}")
+        assert self.asked_by is not None
+        if self._closes:
+            road.smoother.settle()
+            jump = drive.close(road, outcome, self.asked_by)
+            return Step(self.CLOSED(road, drive), jump)
+        if road.growth.taken_back > self._taken_back:
+            return Step(self, notice=f"{failed}: a curve was taken back")
+        notice = "" if drive.revisits else REVISITED  # only the first time
+        return Step(self, drive.lay_on(road, outcome, self.asked_by), notice)
+
+
+def open_map(road: Road, poses: Array) -> StartMap:
+    """Return the present map of an open road, with the poses (P, 3) of all cycles."""
+    road.smoother.transform_to_origin()
+    state = road.smoother.map.state
+    ends = {label: boundary.confirmed_end for label, boundary in state.boundaries.items()}
+    return StartMap(state.splines, poses, state.variables.calibrations.copy(), ends)
+
+
+# --- a return to the beginning ---------------------------------------------------------------------------
+
+
+RETURN_CYCLES: Final = 10  # number of cycles between attempts of a vehicle that hardly moves
+
+
+class ReturnFinder(Copyable):
+    """Search for a return of an open road, some metres or cycles after the last attempt."""
+
+    def __init__(self, settings: MapperSettings) -> None:
+        self._settings = settings
+        self._tried = -inf, 0  # path length (m) and cycle of the last attempt
+        self._rests_until = 0.0  # path length of the next attempt (m)
+
+    def rest(self, road: Road, length: float) -> None:
+        """Pause the search for a length (m) from here."""
+        self._rests_until = road.path.length + length
+
+    def find(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
+        """Return the newest pose relative to an early one, if it is recognized there."""
+        length, cycle, closing = road.path.length, road.next_cycle, self._settings.closing
+        tried, tried_cycle = self._tried
+        waited = length >= tried + closing.check_interval or cycle >= tried_cycle + RETURN_CYCLES
+        if length < self._rests_until or not waited or not road.path.near_beginning(road.poses[-1], closing):
+            return None
+        self._tried = length, cycle
+        curves, smoother = None, road.smoother
+        if self._settings.of_lines:
+            if not road.boundaries:
+                return None
+            smoother.transform_to_origin()
+            smoother.refresh()
+            ends = {label: boundary.confirmed_end for label, boundary in road.boundaries.items()}
+            curves = SampledCurves.of(smoother.map.state.splines, ends)
+        seen_in = record.seen_in(smoother.variables.sensor, noise)
+        poses = unwrap(record.poses) if curves is None else record.with_window(road)
+        return return_to_beginning(seen_in, poses, smoother.newest_covariance(), road.settings, curves)
+
+
+# --- other road that is driven again ---------------------------------------------------------------------
+
+
+REVISIT_ATTEMPTS: Final = 3.0  # distance between attempts (m along the path)
+RETURN: Final = 30.0  # least path length between both passes (m)
+RADIUS: Final = 4.0  # largest distance between both passes in the map (m)
+DIVERGED: Final = 8.0  # least separation of the ways to both passes, seen from the place (m)
+WAY: Final = 100.0  # length of the compared ways (m)
+WAY_STEP: Final = 4.0  # step of their points (m)
+
+
+class Revisits(Copyable):
+    """Search for road that an open drive revisits."""
+
+    def __init__(self, settings: MapperSettings) -> None:
+        self.settings = settings
+        self._next = RETURN  # path length of the next attempt (m)
+
+    def find(self, road: Road, record: DriveRecord, noise: NoiseLearner) -> Revisit | None:
+        """Return the window's oldest pose relative to one of an earlier pass, if an attempt finds it.
+
+        The newest pose will stay in the window, and the batch's marginal has no measurement of such a pose.
+        """
+        length = road.path.length
+        if length < self._next or self.settings.of_lines:
+            return None
+        self._next = length + REVISIT_ATTEMPTS
+        poses = record.with_window(road)
+        place, later = earlier_pass(poses), road.smoother.first_cycle
+        if place is None or place >= later:
+            return None
+        seen_in = record.seen_in(road.smoother.variables.sensor, noise)
+        found = newest_place(seen_in, poses, place, Prior.about(poses[-1], *NEARBY), self.settings)
+        if found is None:
+            return None
+        self._next = length + REVISIT_INTERVAL
+        return revisit_of(found, poses, place, later)
+
+
+def earlier_pass(poses: Array) -> int | None:
+    """Return the nearest cycle of the first earlier pass by the newest of the poses (P, 3), if there is one.
+
+    The ways to both passes must part: otherwise the drive came past its start, as in a lap.
+    """
+    newest = poses[-1]
+    near = np.hypot(*(poses[:, :2] - newest[:2]).T) < RADIUS
+    if path_lengths(poses[near.argmax() :])[-1] <= RETURN:
+        return None  # only the newest poses are near
+    stations = path_lengths(poses)
+    near &= np.cos(poses[:, 2] - newest[2]) > np.cos(HEADING)
+    near &= stations < stations[-1] - RETURN
+    cycles = np.flatnonzero(near)
+    for run in np.split(cycles, np.flatnonzero(np.diff(cycles) > 1) + 1) if len(cycles) else []:
+        place = int(run[np.hypot(*(poses[run, :2] - newest[:2]).T).argmin()])
+        if have_parted(poses, stations, place):
+            return place
+    return None
+
+
+def have_parted(poses: Array, stations: Array, place: int) -> bool:
+    """Whether the ways to the newest of the poses (P, 3) and to an earlier one at `place` part."""
+    back, ways = np.arange(0.0, min(float(stations[place]), WAY), WAY_STEP), []
+    for cycle in (place, -1):
+        at = stations[cycle] - back
+        points = np.column_stack([np.interp(at, stations, poses[:, k]) for k in range(2)])
+        ways.append(to_vehicle(points, poses[cycle][None]))
+    return bool((np.hypot(*(ways[0] - ways[1]).T) > DIVERGED).any())

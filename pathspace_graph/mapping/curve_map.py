@@ -14,9 +14,9 @@ from pathspace_graph.graph.rows import Rows, stacked_rows
 from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, control_keys
 from pathspace_graph.settings.mapper import MapperSettings
 
+from .detection_rows import SIGMA_POSE, Stations
 from .detections import NO_STATION, DetectionTable
 from .state import State, factor_numbers
-from .stations import SIGMA_POSE, Stations
 
 SIGHTINGS_IN_WINDOW: Final = 20.0  # typical number of a cone's detections in a window
 

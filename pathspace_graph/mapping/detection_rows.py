@@ -1,18 +1,19 @@
 """The model of a detection, for window and batch: rows across a curve, and along it at a station."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.graph.drives import Drives
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, Variables
+from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, Drives, Variables
+from pathspace_graph.spline.boundary import ahead_of
 
-from .detections import DetectionTable
+from .detections import NO_STATION, DetectionTable
 from .state import State
 
 
@@ -85,3 +86,114 @@ def measuring_keys(cycle: IntArray, variables: Variables, drives: Drives) -> Int
     sensors = np.asarray(drives.sensors)[drives.of(cycle)]
     keys = np.column_stack([FIRST_POSE + cycle, SENSOR_KEY + sensors])
     return np.asarray(keys[:, : 2 if len(variables.sensor) else 1])
+
+
+# --- stations along the curves ---------------------------------------------------------------------------
+
+
+STATION_CERTAIN: Final = 3.0  # gate along a curve (sigmas), less than half the distance of the next cone
+SIGMA_POSE: Final = 0.2  # standard deviation of the vehicle along a curve in the matching of detections (m)
+
+
+@dataclass(frozen=True, eq=False)
+class CurveStations:
+    """The stations of one curve, ascending."""
+
+    label: int  # of the boundary
+    first: int  # index of the first station among those of all curves
+    u: Array  # (k,) parameters of the cones, within one length (m)
+    sigma: Array  # (k,) standard deviations of the cones along the curve, given the curve (m)
+    apart: Array  # (k,) distances to the nearer neighbour (m)
+    length: float  # length of the curve (m); infinite if open
+
+    @classmethod
+    def of(cls, label: int, first: int, u: Array, sigma: Array, ends: tuple[float, float]) -> Self:
+        """Place at least one cone at parameters (k,) of a curve; an open one ends at infinity."""
+        low, length = ends[0], ends[1] - ends[0]
+        u = low + np.mod(u - low, length)
+        order = np.argsort(u)
+        gaps = np.diff(u[order], append=u[order[0]] + length)
+        return cls(label, first, u[order], sigma[order], np.minimum(gaps, np.roll(gaps, 1)), length)
+
+    def nearest(self, u: Array) -> tuple[IntArray, Array]:
+        """Return the nearest station to each parameter, of any shape, and the distance beyond it (m)."""
+        if self.length == np.inf:
+            after = self.u.searchsorted(u).clip(1, len(self.u) - 1)
+            both = np.stack([after - 1, after])
+            beyond = u - self.u[both]
+        else:
+            after = self.u.searchsorted(self.u[0] + np.mod(u - self.u[0], self.length))
+            both = np.stack([after - 1, after]) % len(self.u)
+            beyond = ahead_of(self.u[both], u, self.length)
+        second = np.abs(beyond[1]) < np.abs(beyond[0])
+        return np.where(second, both[1], both[0]), np.where(second, beyond[1], beyond[0])
+
+    def matched(self, u: Array, sigma: Array) -> IntArray:
+        """Match detections with foot points u (m,) to stations; `NO_STATION` if ambiguous.
+
+        sigma (m,) are their standard deviations along the curve, with the vehicle's. Ambiguity is judged by
+        the expected distances: a choice by the observed ones would be biased to small distances.
+        """
+        station, beyond = self.nearest(u)
+        limit = STATION_CERTAIN * np.hypot(sigma, self.sigma[station])
+        sure = (limit < 0.5 * self.apart[station]) & (np.abs(beyond) < limit)
+        return np.where(sure, self.first + station, NO_STATION)
+
+
+@dataclass(frozen=True, eq=False)
+class Stations:
+    """The stations of all curves of a state, curve by curve, and the basis functions there."""
+
+    curves: tuple[CurveStations, ...]
+    u: Array  # (k,) parameters (m)
+    sigma: Array  # (k,) standard deviations along the curves (m)
+    label: IntArray  # (k,) boundary of each
+    value: Array  # (k, p + 1) basis functions at the stations
+    slope: Array  # (k, p + 1) their derivatives (1/m)
+    columns: IntArray  # (k, p + 1) control points that they weigh, by row of `State.map_points`
+
+    @classmethod
+    def of(cls, state: State, u: Mapping[int, Array], sigma: Mapping[int, Array]) -> Self:
+        """Place cones at parameters (k,) of curves, at least one on each; both mappings are by label."""
+        curves, columns, values, before, count = list[CurveStations](), [], [], 0, 0
+        for label, boundary in state.boundaries.items():
+            ends = boundary.tables.low, boundary.tables.high if boundary.periodic else np.inf
+            own = CurveStations.of(label, count, u[label], sigma[label], ends)
+            value, span = boundary.tables.evaluate(own.u, 1)
+            curves.append(own)
+            columns.append(before + boundary.columns(span))
+            values.append(value)
+            before, count = before + boundary.size, count + len(own.u)
+        value, slope = map(np.ascontiguousarray, np.concatenate(values, axis=1))
+        numbers = np.array([own.label for own in curves]).repeat([len(own.u) for own in curves])
+        places, sigmas = np.concatenate([(own.u, own.sigma) for own in curves], axis=1)
+        return cls(tuple(curves), places, sigmas, numbers, value, slope, np.concatenate(columns))
+
+    def rows(
+        self, state: State, detections: DetectionTable, rows: IntArray, station: IntArray, sigma: Array
+    ) -> DetectionRows:
+        """Linearize `t . (R z + t - S(u))` for detections (m,) at stations (m,) with sigmas (m,) in m.
+
+        The terms are those of `factors._kernels:station_rows`.
+        """
+        cycle, variables, columns = detections.cycle[rows], state.variables, self.columns[station]
+        measuring = measuring_keys(cycle, variables, state.drives)
+        keys = np.concatenate([measuring, state.map_keys[columns]], axis=1)
+        points = detections.points_map(rows, variables)
+
+        def terms(own: IntArray | slice, sensor: Array) -> tuple[Array, Array, Array]:
+            chosen, cones = rows[own], station[own]
+            return kernels.station_rows(
+                points[own],
+                detections.covariance[chosen],
+                variables.poses_at(cycle[own]),
+                self.value[cones],
+                self.slope[cones],
+                state.map_points[columns[own]],
+                detections.measured[chosen],
+                detections.twist[chosen],
+                sensor,
+                sigma[own],
+            )
+
+        return DetectionRows(rows, keys, *state.drives.by_sensor(terms, cycle, variables.sensor))

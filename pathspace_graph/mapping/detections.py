@@ -11,8 +11,7 @@ from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotated, to_map
 from pathspace_graph.factors.sensor import corrected
-from pathspace_graph.graph.drives import ONE_DRIVE, Drives, of_sensor
-from pathspace_graph.graph.variables import Variables
+from pathspace_graph.graph.variables import ONE_DRIVE, Drives, Variables, of_sensor
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import UNKNOWN
 
@@ -60,7 +59,7 @@ class DetectionColumns:
         )
 
     @classmethod
-    def of_drives(cls, tables: Sequence[Self], drives: Drives) -> Self:
+    def of_drives(cls, tables: Sequence["DetectionColumns"], drives: Drives) -> Self:
         """Build the table of several drives with consecutive cycles, with no detection in use."""
         names = ("cycle", "measured", "twist", "covariance", "label")
         cycle, *columns = (np.concatenate([vars(table)[name] for table in tables]) for name in names)

@@ -33,6 +33,7 @@ class Growth:
         self.settings = settings
         self.tentative = {label: TentativeTracks(settings) for label in BOUNDARIES}  # unexplained cones
         self._known: Mapping[int, float] = {}  # ends of curves that were known before the drive (m)
+        self.taken_back = 0  # how often a curve was shortened
         self._full: frozenset[int] = frozenset()  # boundaries that have stopped growing
         self._beside = dict.fromkeys(BOUNDARIES, np.zeros((0, 2)))
 
@@ -142,6 +143,7 @@ class Growth:
         boundary = state.boundaries[label]
         self.tentative[label].restore(boundary.observed[kept:], smoother.times[-1])
         boundary.take_back(kept)
+        self.taken_back += 1
         smoother.remove_information(state.keys(label)[boundary.settled(boundary.size) :])
         rows = detections.used_on(label)
         detections.release(rows[detections.u[rows] > boundary.trusted])

@@ -21,7 +21,6 @@ from pathspace_graph.settings.online import OdometrySettings
 from .path import DrivenPath
 
 DOUBT_CYCLES: Final = 10  # cycles between two checks of the calibrations
-KEYFRAME_INTERVAL: Final = 12.0  # distance of the keyframes of the open drive (m along the path)
 
 
 @dataclass(frozen=True)
@@ -195,7 +194,6 @@ def smoother_settings(settings: MapperSettings) -> SmootherSettings:
         lag=settings.lag,
         max_poses=settings.max_poses,
         tolerances=(settings.relinearize.point, settings.relinearize.heading),
-        keyframe_interval=KEYFRAME_INTERVAL,
         sigmas_calibrations=settings.sigmas_calibrations,
         calibrations=settings.calibrations,
     )

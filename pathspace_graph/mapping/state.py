@@ -13,11 +13,12 @@ from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.graph.drives import ONE_DRIVE, Drives
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
     CONTROL_LETTERS,
+    ONE_DRIVE,
     SENSOR_KEY,
+    Drives,
     Variables,
     control_keys,
 )

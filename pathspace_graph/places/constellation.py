@@ -11,13 +11,13 @@ from scipy.spatial import KDTree
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import (
+    difference,
     left_of,
     move_points,
     path_lengths,
     rotated,
     to_map,
     to_vehicle,
-    wrap_angle,
 )
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import DetectionColumns
@@ -215,11 +215,11 @@ class SampledCurves:
             off, jacobian, variance, inside = self._rows(seen, pose)
             weight = np.where(inside & (np.abs(off) < gate), seen.weight / variance, 0.0)
             H = np.asarray((jacobian * weight[:, None]).T @ jacobian)
-            gradient = jacobian.T @ (weight * off) + information @ _difference(pose, mean)
+            gradient = jacobian.T @ (weight * off) + information @ difference(pose, mean)
             pose = pose - np.linalg.solve(H + information, gradient)
         off, _, variance, inside = self._rows(seen, pose)
         squares = np.minimum(off**2 / variance, FIT_GATE)[inside]
-        away = _difference(pose, mean)
+        away = difference(pose, mean)
         return Fits(
             pose[None],
             (H + REGULAR)[None],
@@ -250,12 +250,6 @@ class SampledCurves:
 def beginning_of(end: float) -> float:
     """Return the length (m) of the beginning of an open curve that is confirmed up to an end (m)."""
     return min(BEGINNING, BEGINNING_SHARE * end)
-
-
-def _difference(pose: Array, other: Array) -> Array:
-    off = pose - other
-    off[2] = wrap_angle(off[2])
-    return off
 
 
 Known = Constellation | SampledCurves

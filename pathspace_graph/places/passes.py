@@ -9,14 +9,14 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import (
     compose,
+    difference,
     path_lengths,
     relative,
     rotation,
     to_map,
     to_vehicle,
-    wrap_angle,
 )
-from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.path import HEADING
 from pathspace_graph.settings.mapper import MapperSettings
@@ -127,8 +127,7 @@ def newest_place(
 def tried_along(poses: Array, prior: Prior) -> Prior:
     """Return a prior about one pose that is tried at those of a path (P, 3), too, where it allows them."""
     _, first = np.unique(path_lengths(poses) // START_STEP, return_index=True)
-    off = np.concatenate([np.zeros((1, 3)), poses[first] - prior.poses])
-    off[:, 2] = wrap_angle(off[:, 2])
+    off = np.concatenate([np.zeros((1, 3)), difference(poses[first], prior.poses)])
     possible = np.einsum("ki,ij,kj->k", off, prior.information, off) < START_CHI2
     return replace(prior, starts=prior.poses + off[possible])
 

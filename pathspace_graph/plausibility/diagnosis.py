@@ -16,7 +16,7 @@ from pathspace_graph.health import LOST
 from pathspace_graph.io.header import CALIBRATION
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
-from pathspace_graph.spline.crossing import Crossing, crossed_boundaries
+from pathspace_graph.spline.boundary import Crossing, crossed_boundaries
 
 from .hint import Hint, hint_of
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.batch.lap import are_of_cones, objection, share_used
 from pathspace_graph.batch.mapper import BatchMapper, find_closed_optimum
-from pathspace_graph.batch.objections import are_of_cones, objection, share_used
 from pathspace_graph.batch.optimizer import Optimizer
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import find_revisits

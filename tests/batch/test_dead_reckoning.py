@@ -13,8 +13,7 @@ from pathspace_graph.batch.system import BatchSystem
 from pathspace_graph.factors.se2 import path_lengths, relative, wrap_angle
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
-from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.graph.rows import OdometryChain
+from pathspace_graph.graph.rows import OdometryChain, Revisit
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable

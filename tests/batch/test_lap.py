@@ -10,24 +10,22 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import (
-    ClosedMap,
     LapMarginal,
     OpenLap,
     lap_optimum,
     marginal_of,
-    rows_before,
     solve_lap,
 )
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.optimizer import Effort
-from pathspace_graph.batch.system import BatchSystem, Evaluation
+from pathspace_graph.batch.start import StartMap
+from pathspace_graph.batch.system import BatchSystem, Evaluation, curve_gauge
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.graph.elimination import eliminated_system, linear_graph
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor
-from pathspace_graph.graph.relative import Revisit
-from pathspace_graph.graph.rows import Rows
+from pathspace_graph.graph.rows import Revisit, Rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, Layout, are_poses, indices, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, SplineBoundary
@@ -63,7 +61,7 @@ def open_lap(settings: MapperSettings | None = None) -> OpenLap:
         chain=judge_log(drive, drive.noise, settings).chain,
         detections=DetectionTable.of(drive.cycles),
         first_kept=len(drive.cycles) - WINDOW,
-        start=ClosedMap(splines, true_poses(drive), np.zeros(2)),
+        start=StartMap(splines, true_poses(drive), np.zeros(2)),
     )
 
 
@@ -78,11 +76,11 @@ def optimum() -> tuple[BatchSystem, Evaluation]:
     return system, at
 
 
-def later(rows: Rows, cycle: int) -> Rows:
-    """Returns the rows whose first pose is of a cycle or a later one."""
+def are_later(rows: Rows, cycle: int) -> NDArray[np.bool_]:
+    """Whether the first pose of each row is of a cycle or a later one."""
     poses = are_poses(rows.keys)
     first = np.where(poses, indices(rows.keys), np.iinfo(np.intp).max).min(axis=1)
-    return rows.where(np.asarray(poses.any(axis=1) & (first >= cycle)))
+    return np.asarray(poses.any(axis=1) & (first >= cycle))
 
 
 def test_the_marginal_and_the_window_are_the_whole_problem() -> None:
@@ -93,13 +91,17 @@ def test_the_marginal_and_the_window_are_the_whole_problem() -> None:
     here = np.concatenate([state.variables.calibration, state.map_points.ravel(), state.poses[first]])
     keys = np.concatenate([[CALIBRATION_KEY], state.map_keys, pose_keys(np.array([first]))])
     root = np.linalg.cholesky(information).T
-    window = [later(rows, first) for rows in system.rows(at) if len(rows) and not is_slide(rows)]
+    groups = [rows for rows in system.rows(at) if len(rows) and not is_slide(rows)]
+    window = [rows.where(are_later(rows, first)) for rows in groups]
     measured = linear_graph(window, state.variables)
     kept = Layout(keys[:-1])
     marginal = jacobian_factor(keys, root, root @ (mean - here))
     found, vector = eliminated_system(graph_of(marginal, measured), kept)
-    early = linear_graph(rows_before(system, at, first), state.variables)
-    expected, right = eliminated_system(graph_of(early, measured), kept)
+    slides = [curve_gauge(state, label, system.sigma_slide, first) for label in state.boundaries]
+    held = [one.rows(state.control_points(one.label), state.poses) for one in slides]
+    early = held + [rows.where(~are_later(rows, first)) for rows in groups]
+    whole = graph_of(linear_graph(early, state.variables), measured)
+    expected, right = eliminated_system(whole, kept)
     scale = np.sqrt(np.diagonal(expected))
     assert found / np.outer(scale, scale) == pytest.approx(expected / np.outer(scale, scale), abs=1e-7)
     assert vector / scale == pytest.approx(right / scale, abs=1e-5)
@@ -108,14 +110,6 @@ def test_the_marginal_and_the_window_are_the_whole_problem() -> None:
 def is_slide(rows: Rows) -> bool:
     """Returns whether these rows hold a control point beside a pose."""
     return rows.keys.shape[1] == 2 and not are_poses(rows.keys[0, 0]) and bool(are_poses(rows.keys[0, 1]))
-
-
-def test_no_measurement_of_the_window_is_in_the_marginal() -> None:
-    system, at = optimum()
-    first = len(log().cycles) - WINDOW
-    for rows in rows_before(system, at, first):
-        poses = are_poses(rows.keys)
-        assert (indices(rows.keys)[poses] <= first).all()
 
 
 def test_the_map_is_as_good_as_that_of_the_batch_over_the_same_log() -> None:
@@ -147,7 +141,7 @@ def test_few_rounds_do_not_converge() -> None:
 
 def test_the_lap_itself_is_not_changed() -> None:
     lap = open_lap()
-    assert isinstance(lap.start, ClosedMap)
+    assert lap.start is not None
     used, poses = deepcopy(lap.detections.used), lap.start.poses.copy()
     solve_lap(lap)
     assert (lap.detections.used == used).all()
@@ -162,7 +156,7 @@ def test_a_search_from_odometry_closes_where_the_revisit_is_right(lap: float) ->
     earlier = int(path_lengths(truth).searchsorted((1.35 - lap) * COURSE))
     revisit = Revisit(earlier, len(truth) - 1, np.zeros(3), np.diag([10.0, 10.0, 50.0]))
     detections, first_kept = DetectionTable.of(drive.cycles), len(drive.cycles) - WINDOW
-    marginal = solve_lap(OpenLap(settings, chain, detections, first_kept, revisit))
+    marginal = solve_lap(OpenLap(settings, chain, detections, first_kept, None, (revisit,)))
     assert (marginal.objection == "") == (lap == 1.0)
     if lap == 1.0:
         assert marginal.convergence.converged

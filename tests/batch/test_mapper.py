@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch import mapper as batch_mapper
+from pathspace_graph.batch.lap import unmapped
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
-from pathspace_graph.batch.objections import unmapped
 from pathspace_graph.batch.optimizer import Convergence, Effort, Optimizer
 from pathspace_graph.batch.system import Evaluation
 from pathspace_graph.cli import main
@@ -230,7 +230,7 @@ def test_a_map_that_lacks_the_cones_of_a_part_of_the_drive_is_objected_to() -> N
 def test_a_map_that_is_objected_to_is_written_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("pathspace_graph.batch.objections.MISS_SHARE", 0.0)
+    monkeypatch.setattr("pathspace_graph.batch.lap.MISS_SHARE", 0.0)
     write_log(bean(), tmp_path / "log")
     arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "odometry"]
     assert main(arguments) == 3

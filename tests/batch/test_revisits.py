@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.objections import BENT_SIGMAS, disagreement
+from pathspace_graph.batch.lap import BENT_SIGMAS, disagreement
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import (
     REVISIT_INTERVAL,
@@ -22,7 +22,7 @@ from pathspace_graph.batch.start import (
 from pathspace_graph.factors.se2 import path_lengths, relative, wrap_angle
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
-from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.io.log import Log
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.batch.association import laps_of, match_stations
 from pathspace_graph.batch.gtsam_graph import nonlinear_graph
 from pathspace_graph.batch.lap import OpenLap, along_of, lap_optimum, marginal_of, stations_on
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.optimizer import predicted_decrease
 from pathspace_graph.batch.simplification import map_block, simplified
-from pathspace_graph.batch.stations import laps_of, match_stations
 from pathspace_graph.batch.system import SIGMA_SLIDE, BatchSystem, Evaluation, moved
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Log

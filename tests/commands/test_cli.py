@@ -23,7 +23,7 @@ from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.io.map import Map, read_map
 from pathspace_graph.io.results import LapBatches, RunResult
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
-from pathspace_graph.spline.crossing import Crossing
+from pathspace_graph.spline.boundary import Crossing
 
 from ..scenes.pretenders import contents
 

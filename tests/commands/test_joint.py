@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pathspace_graph.batch.placement import OTHER_TRACK
+from pathspace_graph.batch.joint import OTHER_TRACK
 from pathspace_graph.cli import main
 from pathspace_graph.commands.estimate import unique_names
 from pathspace_graph.io.log_files import write_log

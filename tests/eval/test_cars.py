@@ -17,8 +17,8 @@ from pathspace_graph.eval.cars import (
     metrics_of_group,
     surveyed,
 )
+from pathspace_graph.eval.metrics.alignment import motion_onto
 from pathspace_graph.eval.metrics.reference import truth_of
-from pathspace_graph.eval.metrics.registration import motion_onto
 from pathspace_graph.factors.se2 import compose, move_points
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.sim.track import to_map_frame

@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.noise import TwistNoise
-from pathspace_graph.front_end.motion import MotionCheck
-from pathspace_graph.front_end.standstill import Standstill
+from pathspace_graph.front_end.motion import MotionCheck, Standstill
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.motion import MeasuredMotion

@@ -12,8 +12,7 @@ from pathspace_graph.factors._kernels import odometry_residuals
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import compose, inverse, move_points, rotation
 from pathspace_graph.graph.gaussian import graph_of, jacobian_factor, keys_of, marginalize, normal_equations
-from pathspace_graph.graph.inactive import InactiveChain, pose_and_reference
-from pathspace_graph.graph.relative import from_frame, relative_factor
+from pathspace_graph.graph.inactive import InactiveChain, from_frame, pose_and_reference, relative_factor
 from pathspace_graph.graph.rows import Rows, at_reference, jacobian_factors
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,

@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.graph.drives import ONE_DRIVE, Drives, of_sensor
-from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, control_keys, pose_keys
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    ONE_DRIVE,
+    SENSOR_KEY,
+    Drives,
+    Variables,
+    control_keys,
+    of_sensor,
+    pose_keys,
+)
 
 Array = NDArray[np.float64]
 

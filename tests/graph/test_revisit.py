@@ -8,9 +8,8 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, relative, wrap_angle
-from pathspace_graph.graph.gaussian import graph_of, normal_equations
-from pathspace_graph.graph.relative import Revisit, revisit_rows
-from pathspace_graph.graph.variables import Layout, Variables, pose_keys
+from pathspace_graph.graph.rows import Revisit, revisit_rows
+from pathspace_graph.graph.variables import pose_keys
 
 from ..scenes.jacobians import numeric_jacobian
 
@@ -63,13 +62,3 @@ def test_rows_of_several_revisits_have_right_jacobians() -> None:
         np.testing.assert_allclose(rows.jacobian[own], expected, atol=1e-6)
     assert len(set(rows.owner.tolist())) == 2, "of one factor where the later pose is the same"
     assert revisit_rows([], poses) == []
-
-
-def test_the_engine_s_factor_is_the_same() -> None:
-    revisit, poses = scene(2)
-    variables, keys = Variables(), pose_keys(np.array([EARLIER, LATER]))
-    variables.insert(keys, poses[[EARLIER, LATER]].ravel())
-    information, vector = normal_equations(graph_of(revisit.factor().factor(variables)), Layout(keys))
-    (rows,) = revisit_rows([revisit], poses)
-    np.testing.assert_allclose(information, rows.jacobian.T @ rows.jacobian, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(vector, -rows.jacobian.T @ rows.residual, rtol=1e-9, atol=1e-9)

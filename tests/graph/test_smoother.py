@@ -9,25 +9,22 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose
-from pathspace_graph.graph.changes import merge_points, solve_loop
-from pathspace_graph.graph.gaussian import factorize, graph_of, keys_of, normal_equations
+from pathspace_graph.graph.gaussian import factorize, keys_of, normal_equations
 from pathspace_graph.graph.rows import Rows, calibrated_delta
-from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.smoother import FixedLagSmoother, merge_points
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, control_keys, pose_key, pose_keys
 from pathspace_graph.graph.window import SmootherSettings
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
 
-from ..scenes.drives import ODOMETRY_SIGMA, bean_track, lap_log, true_poses
+from ..scenes.drives import ODOMETRY_SIGMA, bean_track, lap_log
 from ..scenes.graph import columns_of, rows_in
 from ..scenes.linear_drive import LinearDrive, LinearTrack
 
 # --- poses that come and go ------------------------------------------------------------------------------
 
-SETTINGS = SmootherSettings(
-    lag=2.0, tolerances=(1e-9, 1e-9), keyframe_interval=1e9, sigmas_calibrations=(0.25, 0.5)
-)
+SETTINGS = SmootherSettings(lag=2.0, tolerances=(1e-9, 1e-9), sigmas_calibrations=(0.25, 0.5))
 ODOMETRY = integrate_twists(np.full(4, 0.25), np.tile([8.0, 0.1, 0.4], (4, 1)), np.array([0.2, 0.1, 0.05]))
 
 
@@ -47,7 +44,6 @@ def test_the_first_pose_is_predicted_from_the_start_with_both_uncertainties() ->
     found = factorize(smoother.prior, smoother.layout).covariance(pose_keys(np.array([0])))
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
     assert smoother.times == [3.0]
-    assert smoother.submaps is not None
     assert len(smoother.window.odometry) == 0
 
 
@@ -103,11 +99,11 @@ def test_nothing_to_reactivate_changes_nothing() -> None:
     drive = LinearDrive(2)
     drive.drive(5)
     smoother = drive.smoother
-    before = smoother.prior, smoother.inactive, smoother.submaps
+    before = smoother.prior, smoother.inactive
     smoother.reactivate()
     smoother.deactivate(np.zeros(0, np.intp))
     smoother.refresh()
-    assert (smoother.prior, smoother.inactive, smoother.submaps) == before
+    assert (smoother.prior, smoother.inactive) == before
 
 
 # --- a linear drive --------------------------------------------------------------------------------------
@@ -167,32 +163,6 @@ def test_the_prior_of_a_calibration_can_be_changed_several_times_and_back() -> N
         drive.drive(3)
     ours, theirs = changed.smoother.variables, other.smoother.variables
     np.testing.assert_allclose(ours.values, theirs.values, rtol=1e-7, atol=1e-7)
-
-
-def test_the_submaps_of_an_open_loop_have_the_other_prior_of_the_calibration() -> None:
-    """They take the prior's place when the loop closes: by hand, and as a smoother made with it has them."""
-    means, sigmas = (0.4, -0.9), (0.7, 3.0)
-    changed, other = LinearDrive(2), LinearDrive(2, means=means, sigmas=sigmas)
-    for drive in (changed, other):
-        drive.drive(6)
-    changed.smoother.set_calibration_priors(np.array(means), np.array(sigmas))
-    for drive in (changed, other):
-        drive.drive(3)
-    found = []
-    for drive in (changed, other):
-        submaps, variables = drive.smoother.submaps, drive.smoother.variables
-        assert submaps is not None
-        own = Layout(np.array([CALIBRATION_KEY, pose_key(0)]))
-        assert keys_of(submaps.first).tolist() == own.keys.tolist()
-        hessian, vector = normal_equations(submaps.first, own)
-        reference = np.zeros(own.size)  # of the first pose it is where that was predicted, in both
-        reference[:2] = variables.reference[:2]
-        found.append((hessian, vector + hessian @ reference))
-    for ours, theirs in zip(*found, strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-12)
-    hessian, vector = found[0]
-    np.testing.assert_allclose(hessian[:2, :2], np.diag(np.array(sigmas) ** -2.0), atol=1e-12)
-    np.testing.assert_allclose(vector[:2], means / np.array(sigmas) ** 2, atol=1e-12)
 
 
 def test_covariance_is_in_the_order_of_the_keys() -> None:
@@ -423,25 +393,3 @@ def test_covariance_is_the_dense_inverse_of_the_graph_at_the_estimate() -> None:
     entries = columns_of(keys, smoother.layout.keys)
     expected = np.linalg.inv(hessian)[np.ix_(entries, entries)]
     np.testing.assert_allclose(smoother.covariance(keys), expected, rtol=1e-6, atol=1e-9)
-
-
-# --- closing ---------------------------------------------------------------------------------------------
-
-
-def test_a_loop_is_solved_with_its_keyframes_and_without_them_afterwards() -> None:
-    mapper = drive_bean(MapperSettings(), 100)
-    smoother = mapper.road.smoother
-    assert smoother.submaps is not None and len(smoother.submaps.keyframes) > 1
-    keys = smoother.variables.keys
-    stay = ~np.isin(keys, smoother.variables.keyframes)
-    before = smoother.variables.of(keys[stay])
-    solve_loop(smoother, 2, 10.0)
-    assert smoother.submaps is None and len(smoother.inactive) == 0
-    np.testing.assert_array_equal(smoother.variables.keys, keys[stay])
-    assert len(smoother.variables.keyframes) == 0
-    truth = true_poses(lap_log(bean_track(), 0.0))[smoother.first_cycle : smoother.next_cycle]
-    off = np.abs(smoother.variables.poses - truth).max(axis=0)
-    assert (off < (5e-3, 5e-3, 2e-4)).all()  # the curves are not exactly those of the cones
-    sigma = np.sqrt(np.diagonal(smoother.covariance(keys[stay])))
-    assert (np.abs(smoother.variables.of(keys[stay]) - before) < 0.2 * sigma).all()
-    assert set(keys_of(graph_of(smoother.prior)).tolist()) <= set(smoother.variables.keys.tolist())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.periodic import make_periodic
+from pathspace_graph.baselines.filters import make_periodic
 from pathspace_graph.eval.metrics.accuracy import cone_distances
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
@@ -51,7 +51,7 @@ def open_lap(log: Log) -> FixedLagMapper:
     """The mapper some metres after its curves are met again, which it does not notice."""
     cycle = next(k for k, result in enumerate(mapped(log)[1]) if result.closed)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pathspace_graph.loop.returns.return_to_beginning", lambda *_: None)
+        patch.setattr("pathspace_graph.loop.open.return_to_beginning", lambda *_: None)
         mapper, results = map_log(replace(log, cycles=log.cycles[:cycle]))
     assert not results[-1].closed
     return mapper

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
 from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_twists
-from pathspace_graph.factors.se2 import compose, wrap_angle
+from pathspace_graph.factors.se2 import wrap_angle
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.front_end.noise import NoiseLearner
-from pathspace_graph.graph.relative import Revisit
+from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.drive_record import DriveRecord, bend
+from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry, known_noise
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.settings.mapper import MapperSettings
@@ -70,7 +70,7 @@ def test_a_record_that_was_given_up_keeps_the_first_reason() -> None:
 def test_the_chain_of_the_lap_is_the_odometry_that_was_measured() -> None:
     record = driven(0.5, 0.0)
     settings = MapperSettings(odometry=OdometrySettings(sigma_scale=0.1, sigma_bias=0.2))
-    chain = record.lap(3, AGAIN, settings, NOISE).chain
+    chain = record.lap(3, None, (AGAIN,), settings, NOISE).chain
     np.testing.assert_array_equal(chain.calibration_sigma, [0.1, 0.2])
     poses = chain.dead_reckoned(np.zeros(2))
     angle = len(poses) * SPEED * CYCLE / RADIUS
@@ -89,48 +89,6 @@ def test_the_heading_of_replaced_poses_does_not_jump() -> None:
         np.testing.assert_allclose(np.diff(poses[:, 2]), SPEED * CYCLE / RADIUS, atol=1e-9)
 
 
-# --- poses in the closed map -----------------------------------------------------------------------------
-
-
-def path() -> Array:
-    """Return poses (30, 3) of a path that turns at random; the vehicle stands still for some cycles."""
-    rng = np.random.default_rng(3)
-    poses = [np.zeros(3)]
-    for cycle in range(29):
-        driven = 0.0 if cycle in (7, 8, 9) else rng.uniform(0.5, 1.5)
-        poses.append(compose(poses[-1], np.array([driven, 0.0, rng.uniform(-0.2, 0.2)])))
-    return np.array(poses)
-
-
-def test_a_path_moves_rigidly_with_one_known_pose_or_several_of_one_motion() -> None:
-    poses, motion = path(), np.array([4.0, -7.0, 0.3])
-    moved = np.array([compose(motion, pose) for pose in poses])
-    for cycles in ([0], [0, 8], [0, 8, 9, 20], [0, 29]):
-        found = bend(poses, {cycle: moved[cycle] for cycle in cycles})
-        np.testing.assert_allclose(found, moved, atol=1e-12)
-
-
-def test_a_bent_path_goes_through_its_known_poses_and_between_them_is_a_mean() -> None:
-    straight = np.column_stack([np.arange(11.0), np.zeros((11, 2))])
-    known = {0: np.zeros(3), 10: np.array([10.0, 2.0, 0.0])}
-    np.testing.assert_allclose(bend(straight, known)[:, 1], 0.2 * np.arange(11), atol=1e-12)
-    poses = path()
-    noise = 0.3 * np.random.default_rng(4).normal(size=(30, 3))
-    known = {cycle: poses[cycle] + noise[cycle] for cycle in (0, 5, 8, 17)}
-    bent = bend(poses, known)
-    for cycle, pose in known.items():
-        np.testing.assert_allclose(bent[cycle], pose, atol=1e-12)
-    np.testing.assert_allclose(np.diff(bent[17:, 2]), np.diff(poses[17:, 2]), atol=1e-12)
-
-
-def test_a_known_heading_may_be_wrapped() -> None:
-    poses = path() + np.array([0.0, 0.0, np.pi])
-    known = {cycle: np.append(poses[cycle, :2], wrap_angle(poses[cycle, 2])) for cycle in (0, 10, 20)}
-    found = bend(poses, known)
-    np.testing.assert_allclose(found[:, :2], poses[:, :2], atol=1e-9)
-    np.testing.assert_allclose(wrap_angle(found[:, 2] - poses[:, 2]), 0.0, atol=1e-9)
-
-
 # --- noise -----------------------------------------------------------------------------------------------
 
 
@@ -146,16 +104,9 @@ def test_a_lap_is_solved_with_the_noise_that_is_known_when_it_closes() -> None:
         record.measured(front_end.update(odometry, replace(cone, t=0.2 * (k + 1))))
     along, across = RayNoise(np.array([0.1, 0.05])), RayNoise(np.array([0.0, 0.02]))
     noise.measured = MeasuredNoise(stated, drift, 0.05, along, across)
-    lap = record.lap(0, AGAIN, MapperSettings(), noise)
+    lap = record.lap(0, None, (AGAIN,), MapperSettings(), noise)
     expected = integrate_twists(np.full(4, 0.05), twist, np.hypot(stated, drift / np.sqrt(0.05)))
     found = lap.chain.odometry.intervals[0].covariance
     np.testing.assert_allclose(found, expected.covariance, atol=2.0 * MIN_SIGMA**2)
     np.testing.assert_array_equal(lap.detections.covariance, noise.for_map(cone).covariances[[0, 0]])
     assert lap.detections.covariance[0, 0, 0] > 100.0 * cone.covariances[0, 0, 0]
-
-
-def test_headings_between_two_known_poses_turn_the_short_way() -> None:
-    """The last known heading is a turn more than the first, which is the same direction."""
-    poses = np.column_stack([np.arange(5.0), np.zeros((5, 2))])
-    bent = bend(poses, {0: poses[0], 4: poses[4] + [0.0, 0.0, 2.0 * np.pi]})
-    np.testing.assert_allclose(bent[:4], poses[:4], atol=1e-9)

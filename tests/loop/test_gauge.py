@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pathspace_graph.graph.changes import restart
+from pathspace_graph.graph.smoother import restart
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop.closing import fix_gauge, motion_across
 from pathspace_graph.mapping.state import State

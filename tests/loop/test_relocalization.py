@@ -15,8 +15,8 @@ from pathspace_graph.factors.arrays import BoolArray
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.se2 import compose, to_vehicle
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
-from pathspace_graph.graph.changes import forget_poses
 from pathspace_graph.graph.gaussian import factorize, marginalize
+from pathspace_graph.graph.smoother import forget_poses
 from pathspace_graph.graph.variables import Layout, pose_keys
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log, Odometry

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pathspace_graph.loop import returns
-from pathspace_graph.loop.returns import RETURN_CYCLES, ReturnFinder
+from pathspace_graph.loop import open as open_road
+from pathspace_graph.loop.open import RETURN_CYCLES, ReturnFinder
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 
@@ -20,9 +20,11 @@ STEP = MapperSettings().closing.check_interval
 def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return a list that gets what is tried."""
     ways: list[str] = []
-    monkeypatch.setattr(returns, "unwrap", lambda poses: poses)
+    monkeypatch.setattr(open_road, "unwrap", lambda poses: poses)
     monkeypatch.setattr(
-        returns, "return_to_beginning", lambda *found: ways.append("cones" if found[-1] is None else "curves")
+        open_road,
+        "return_to_beginning",
+        lambda *found: ways.append("cones" if found[-1] is None else "curves"),
     )
     return ways
 

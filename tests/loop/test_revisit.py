@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache, partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pathspace_graph import FixedLagMapper, MapperSettings
+from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import move_points, to_vehicle
-from pathspace_graph.graph.relative import revisit_rows
+from pathspace_graph.factors.se2 import relative, to_vehicle
+from pathspace_graph.graph.gaussian import keys_of, normal_equations
+from pathspace_graph.graph.rows import revisit_rows
+from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
-from pathspace_graph.loop import revisit as revisit_module
-from pathspace_graph.loop.revisit import Revisits, earlier_pass
+from pathspace_graph.loop import drive as drive_module
+from pathspace_graph.loop.drive import Drive, Step
+from pathspace_graph.loop.lap_solver import Outcome
+from pathspace_graph.loop.open import NOT_REVISITED, Open, Revisits, earlier_pass
+from pathspace_graph.mapping.road import Road
+from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.run import CycleResult
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
@@ -69,28 +76,6 @@ def test_an_opposite_pass_whose_ways_part_is_none() -> None:
     assert earlier_pass(passes) == pytest.approx(70, abs=1)
 
 
-def test_what_is_fixed_to_the_vehicle_stays_so_after_a_jump_that_turns(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Path, tracks and cones move by the motion that takes the newest pose from before to after."""
-    before, after = np.array([10.0, 4.0, 0.5]), np.array([12.0, -3.0, 1.7])
-    cone, moved = np.array([[15.0, 6.0]]), list[Array]()
-    road = SimpleNamespace(
-        poses=before[None].copy(), smoother=None, settings=MapperSettings(), move=moved.append
-    )
-
-    def solve(*_: object) -> dict[int, Array]:
-        road.poses[-1] = after
-        return {}
-
-    monkeypatch.setattr(revisit_module, "solve_revisit", solve)
-    record, measured = SimpleNamespace(bent=lambda *_: None), SimpleNamespace(factor=lambda: None)
-    jump = revisit_module.lay_on(road, record, measured)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(jump, after - before)
-    seen = to_vehicle(cone, before[None])
-    np.testing.assert_allclose(to_vehicle(move_points(moved[0], cone), after[None]), seen, atol=1e-9)
-
-
 # --- the drive of a skidpad ------------------------------------------------------------------------------
 
 
@@ -132,6 +117,98 @@ def test_the_map_is_better_for_them_and_nothing_is_closed(monkeypatch: pytest.Mo
     alone = errors(np.array([result.pose for result in without]), truth)
     assert with_them[-50:].mean() < 0.5 * alone[-50:].mean()
     assert smoothed.mean() < 0.5 * alone.mean()
+
+
+@dataclass(frozen=True)
+class Replaced:
+    """An open road just before and after a batch has replaced its map."""
+
+    marginal: LapMarginal
+    before: Road
+    after: Road
+    jump: Array
+
+
+@cache
+def replaced() -> list[Replaced]:
+    """Return the replacements of a drive, without the steps that follow each."""
+    found, take = list[Replaced](), drive_module.swap_in
+
+    def swap_in(road: Road, marginal: LapMarginal) -> Array:
+        before, after = road.copy(), road.copy()
+        before.smoother.transform_to_origin()
+        with pytest.MonkeyPatch.context() as without_steps:
+            without_steps.setattr(CurveSmoother, "step", lambda *_: None)
+            found.append(Replaced(marginal, before, after, take(after, marginal)))
+        return take(road, marginal)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drive_module, "swap_in", swap_in)
+        map_log(drive())
+    assert len(found) >= 3
+    return found
+
+
+def test_poses_before_the_end_of_a_batch_are_its_own_and_later_ones_move_rigidly() -> None:
+    for one in replaced():
+        solved, poses = one.marginal.poses[one.marginal.first_kept :], one.after.poses
+        np.testing.assert_allclose(poses[: len(solved)], solved, atol=1e-9)
+        earlier = one.before.poses[len(one.before.poses) - len(poses) :]
+        for k in range(len(solved), len(poses)):
+            driven = relative(earlier[len(solved) - 1], earlier[k])
+            np.testing.assert_allclose(relative(solved[-1], poses[k])[:2], driven[:2], atol=1e-9)
+        np.testing.assert_allclose(one.jump, poses[-1] - earlier[-1], atol=1e-9)
+
+
+def test_what_is_fixed_to_the_vehicle_stays_so() -> None:
+    """The end that has grown since, its cones, and the driven path have the same place in its frame."""
+    grown = 0
+    for one in replaced():
+        before, after = one.before.poses[-1:], one.after.poses[-1:]
+        for label, boundary in one.after.boundaries.items():
+            known = one.before.boundaries[label]
+            seen = to_vehicle(known.observed, before)
+            np.testing.assert_allclose(to_vehicle(boundary.observed, after), seen, atol=1e-9)
+            old, new = (road.smoother.map.state.control_points(label) for road in (one.before, one.after))
+            spline = one.marginal.splines[label]
+            if boundary.confirmed_end == one.marginal.ends[label]:
+                np.testing.assert_array_equal(new[: spline.size], spline.control_points)
+                continue
+            placed = boundary.settled(spline.size, boundary.last_cone(one.marginal.ends[label]))
+            grown += len(new) - placed
+            np.testing.assert_array_equal(new[:placed], spline.control_points[:placed])
+            at = to_vehicle(old[placed:], before)
+            np.testing.assert_allclose(to_vehicle(new[placed:], after), at, atol=1e-9)
+    assert grown > 10
+
+
+def test_the_prior_is_the_marginal_with_the_present_priors_of_the_calibrations() -> None:
+    for one in replaced():
+        smoother, marginal = one.after.smoother, one.marginal
+        layout = Layout(np.sort(keys_of(smoother.prior)))
+        information, vector = normal_equations(smoother.prior, layout)
+        own, expected = slice(0, len(marginal.calibration)), marginal.information.copy()
+        sigmas = smoother.calibration_prior[1], marginal.calibration_prior[1]
+        expected[own, own] += np.diag(sigmas[0] ** -2.0 - sigmas[1] ** -2.0)
+        scale = np.sqrt(np.diagonal(expected))
+        assert np.abs((information - expected) / np.outer(scale, scale)).max() < 1e-9
+        if (sigmas[0] == sigmas[1]).all():
+            reference = smoother.variables.reference[smoother.variables.layout.entries(layout.keys)]
+            off = reference + np.linalg.solve(information, vector) - marginal.mean
+            assert off @ information @ off < 1e-6
+
+
+def test_a_curve_that_was_taken_back_meanwhile_keeps_its_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    take = Open.take
+
+    def taken_back(self: Open, road: Road, drive: Drive, outcome: Outcome) -> Step:
+        road.growth.taken_back += 1
+        return take(self, road, drive, outcome)
+
+    monkeypatch.setattr(Open, "take", taken_back)
+    mapper, results = map_log(drive())
+    assert not mapper.revisits and all(result.jump is None for result in results)
+    assert any(result.notice == f"{NOT_REVISITED}: a curve was taken back" for result in results)
 
 
 def test_the_batch_takes_them_from_the_online_run() -> None:

@@ -25,9 +25,9 @@ from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import drive as drives
 from pathspace_graph.loop import worker
 from pathspace_graph.loop.closing import _move_poses
-from pathspace_graph.loop.drive_record import DriveRecord
+from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.loop.open import STAYS_OPEN
-from pathspace_graph.mapping.road import HELD
+from pathspace_graph.mapping.road import HELD, Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
@@ -149,9 +149,9 @@ def swapped() -> tuple[Swap, OpenLap]:
     calibrations: list[Array] = []
     take, record, associate = drives.swap_in, DriveRecord.lap, CurveSmoother.reassociate
 
-    def swap_in(smoother: CurveSmoother, marginal: LapMarginal) -> Array:
-        jump = take(smoother, marginal)
-        swaps.append(swap_of(smoother, marginal, calibrations[-1]))
+    def swap_in(road: Road, marginal: LapMarginal) -> Array:
+        jump = take(road, marginal)
+        swaps.append(swap_of(road.smoother, marginal, calibrations[-1]))
         return jump
 
     def reassociate(self: CurveSmoother) -> None:

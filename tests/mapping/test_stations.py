@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.mapping.detection_rows import CurveStations, Stations
 from pathspace_graph.mapping.detections import NO_STATION
-from pathspace_graph.mapping.stations import CurveStations, Stations
 
 from ..scenes.batch import ring, state_of
 

@@ -28,8 +28,7 @@ from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import pose_key, pose_keys
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import NAMES
-from pathspace_graph.loop.drive import Drive
-from pathspace_graph.loop.drive_record import DriveRecord
+from pathspace_graph.loop.drive import Drive, DriveRecord
 from pathspace_graph.loop.open import Open
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.run import CycleResult

@@ -129,7 +129,6 @@ class LinearDrive:
         settings = SmootherSettings(
             lag=float(self.lag),
             tolerances=(self.tolerance, self.tolerance),
-            keyframe_interval=1e9,
             sigmas_calibrations=self.sigmas,
             calibrations=self.means,
         )

@@ -8,8 +8,8 @@ import pytest
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.lengths import times
+from pathspace_graph.spline.boundary import Crossing, crossed_boundaries, crossings_told
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.crossing import Crossing, crossed_boundaries, crossings_told
 
 X = np.arange(0.0, 61.0, 2.0)
 STRAIGHT = np.column_stack([np.arange(0.0, 60.0), np.zeros(60)])

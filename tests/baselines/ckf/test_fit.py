@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.ckf_update import fit_detections, regularization, ridge_gain
+from pathspace_graph.baselines.ckf_curves import fit_detections, regularization, ridge_gain
 from pathspace_graph.settings.mapper import CkfSettings
 from pathspace_graph.spline.bspline import BSpline
 

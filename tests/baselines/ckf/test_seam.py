@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.periodic import Overlap, find_overlap, make_periodic
+from pathspace_graph.baselines.filters import Overlap, find_overlap, make_periodic
 from pathspace_graph.settings.mapper import Knots, MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 

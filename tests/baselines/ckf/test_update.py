@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.baselines.ckf_belief import to_vehicle_rows
-from pathspace_graph.baselines.ckf_update import classify, on_curve, update
+from pathspace_graph.baselines.ckf_curves import classify, on_curve, update
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.settings.mapper import CkfSettings
 

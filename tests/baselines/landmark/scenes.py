@@ -7,8 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_batch import LandmarkSystem, start_oracle
-from pathspace_graph.baselines.landmark_map import LandmarkMap, LandmarkSmoother, LandmarkState
+from pathspace_graph.baselines.landmark_map import (
+    LandmarkMap,
+    LandmarkSmoother,
+    LandmarkState,
+    LandmarkSystem,
+    start_oracle,
+)
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.graph.elimination import linear_graph
 from pathspace_graph.graph.gaussian import jacobian_factor

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_association import merge
 from pathspace_graph.baselines.landmark_fixed_lag import (
     JointCompatibility,
     detect_loop,
-    optimize_loop,
 )
 from pathspace_graph.labels import LEFT, RIGHT
 
-from .scenes import driven, with_covariance
+from .scenes import with_covariance
 
 Array = NDArray[np.float64]
 
@@ -94,15 +92,3 @@ def test_a_row_with_equal_distances_is_not_recognized() -> None:
 
 def test_too_few_landmarks_close_no_loop() -> None:
     assert detected(np.array([3.0]), 1.0) is None
-
-
-def test_the_loop_is_optimized_with_its_pairs_held_together() -> None:
-    smoother = driven(4)
-    apart = np.hypot(*(smoother.map.state.landmarks[4] - smoother.map.state.landmarks[0]))
-    pairs = np.array([4]), np.array([0])
-    optimize_loop(smoother, *pairs)
-    np.testing.assert_array_equal(smoother.map.loop_pairs, [[4, 0]])
-    assert np.hypot(*(smoother.map.state.landmarks[4] - smoother.map.state.landmarks[0])) < 0.9 * apart
-    merge(smoother, *pairs)
-    assert len(smoother.map.loop_pairs) == 0
-    assert len(smoother.map.state) == 4

@@ -25,31 +25,17 @@ IntArray = NDArray[np.intp]
 def test_rows_are_the_derivatives_of_their_residuals() -> None:
     smoother = driven(4)
     variables, track = smoother.variables, smoother.map
-    track.loop_pairs = np.array([[4, 0], [3, 2]])
 
     def whitened(x: Array) -> tuple[Array, Array]:
         variables.values = x
-        groups = [*track.rows(np.arange(1, 4)), *track.linear_gauge(False)]
+        groups = track.rows(np.arange(1, 4))
         residual = np.concatenate([rows.residual for rows in groups])
         dense = [_dense(rows.columns(variables.layout), rows.jacobian, len(x)) for rows in groups]
         return residual, np.concatenate(dense)
 
     x = variables.values + np.random.default_rng(0).normal(0.0, 0.3, len(variables.values))
-    assert len(whitened(x)[0]) == 2 * (3 * len(CONES) + 2)  # the first cycle was not asked for
+    assert len(whitened(x)[0]) == 2 * 3 * len(CONES)  # the first cycle was not asked for
     assert_jacobians(whitened, [x])
-
-
-def test_a_loop_pair_pulls_two_landmarks_together() -> None:
-    smoother = driven(3)
-    apart = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
-    smoother.map.loop_pairs = np.array([[4, 0]])
-    smoother.step()
-    held = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
-    smoother.map.loop_pairs = np.zeros((0, 2), np.intp)
-    smoother.step()
-    free = np.diff(smoother.map.state.landmarks[[0, 4]], axis=0)
-    assert np.hypot(*held.T) < 0.9 * np.hypot(*apart.T)
-    np.testing.assert_allclose(free, apart, atol=1e-3)  # nothing remains of the pair
 
 
 def test_the_last_steps_covariance_is_the_inverse_of_its_system() -> None:

@@ -8,9 +8,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.joint_mapper import JointResult, driven, join
+from pathspace_graph.batch.joint import Driven, JointResult, driven, join
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
-from pathspace_graph.batch.placement import Driven
 from pathspace_graph.factors.se2 import compose, inverse, to_vehicle
 from pathspace_graph.io.log import Log
 from pathspace_graph.online.fixed_lag import FixedLagMapper

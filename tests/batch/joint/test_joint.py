@@ -10,11 +10,16 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.association import Cones, first_parameter, seen_by_most
-from pathspace_graph.batch.joint import JointSystem, PlacedDrive, drives_of, joint_state
-from pathspace_graph.batch.joint_mapper import solve_together
+from pathspace_graph.batch.joint import (
+    OTHER_TRACK,
+    JointSystem,
+    PlacedDrive,
+    drives_of,
+    joint_state,
+    solve_together,
+)
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.optimizer import Optimizer
-from pathspace_graph.batch.placement import OTHER_TRACK
 from pathspace_graph.batch.system import moved as stepped
 from pathspace_graph.errors import SettingsError, SolveError
 from pathspace_graph.eval.metrics.accuracy import lap_metrics

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pathspace_graph.batch.placement import (
+from pathspace_graph.batch.joint import (
     OTHER_START,
     OTHER_TRACK,
     OTHER_WAY,

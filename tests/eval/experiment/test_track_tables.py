@@ -8,7 +8,7 @@ import pytest
 
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.eval.experiment.tables import Table, track_tables
-from pathspace_graph.eval.metrics.metric import METRICS
+from pathspace_graph.eval.metrics.measures import METRICS
 
 RUNS = {  # rmse (m) of laps 1, 2 and 3
     ("oval", 0): (0.6, 0.2, 0.1),

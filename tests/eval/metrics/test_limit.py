@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_batch import solve_landmarks
+from pathspace_graph.baselines.landmark_map import solve_landmarks
 from pathspace_graph.eval.metrics.accuracy import root_mean_square
 from pathspace_graph.eval.metrics.reference import (
     landmark_rmse,

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 from pathspace_graph.eval.metrics.measures import (
+    METRICS,
+    PAPER,
     WHOLE,
+    Metric,
     closes_falsely,
     covariance_bytes,
     map_bytes,
     measure,
     stage_times,
 )
-from pathspace_graph.eval.metrics.metric import METRICS, PAPER, Metric
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState

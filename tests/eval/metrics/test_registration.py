@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.metrics.registration import NOT_STANDING, end_by_registration, standing
+from pathspace_graph.eval.metrics.alignment import NOT_STANDING, end_by_registration, standing
 from pathspace_graph.front_end.front_end import measure_log, seen_cycles
 from pathspace_graph.sim.faults import Faults, OdometryFaults
 from pathspace_graph.sim.sensor import SensorSettings

@@ -6,8 +6,14 @@ import numpy as np
 
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.front_end.front_end import FrontEnd
-from pathspace_graph.front_end.line_matching import LineMatch, Seen, merged, targets_on_lines
-from pathspace_graph.front_end.scan_matching import MATCH_LIMITS, REACHES
+from pathspace_graph.front_end.scan_matching import (
+    MATCH_LIMITS,
+    REACHES,
+    LineMatch,
+    Seen,
+    merged,
+    targets_on_lines,
+)
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.run import split_odometry
