@@ -57,9 +57,9 @@ def hints(log: Log) -> list[Hint]:
     stay = log.sensor.kind != "line" and not is_line(log)
     with threadpool_limits(limits=1):
         found += of_positions + of_rows + (camera(log) or motion_hints(log))
-        found = found or of_kind(log)
-        if not found and stay:
-            found = one_label(log) + side_hints(log)
+        found = found or side_hints(log) or of_kind(log)
+        if stay:
+            found = found or one_label(log)
     return of_cycles + (found or noise_hints(log, stay=stay))
 
 
@@ -242,7 +242,8 @@ WELL_EXPLAINED: Final = 0.5  # least explained share for a small turn and a plac
 FAR_LESS: Final = 0.4  # largest share that a fit explains of another drive, by what the cones show
 SIDES_TOLD: Final = 0.015  # least difference between the lags of both sides that is told (s),
 SIDES_CLEAR: Final = 4.0  # and in standard deviations
-SIDES: Final = 2000, 200  # approximate number of cycles of a side in use, and least number of motions
+SIDES: Final = 2000, 200  # approximate number of cycles of a side in use, and least number of motions,
+SIDES_EXPLAINED: Final = 0.4  # of which at least this share is explained: of points of lines it is 0.3
 FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation (degrees) and whether mirrored
     (180, False): ("the sensor's frame has x to the rear and y to the right", "-x", "-y"),
     (-90, False): ("the sensor's frame has x to the right and y ahead", "y", "-x"),
@@ -395,7 +396,11 @@ def side_hints(log: Log) -> list[Hint]:
         if len(motions.rate) < least:
             return []
         regression = Regression(log.odometry, motions)
-        lags.append(regression.lag(regression.fit("twist", 0.0)))
+        fit = regression.fit("twist", 0.0)
+        lag, sigma = regression.lag(fit)
+        if regression.explained(replace(fit, lag=lag)).both.mean() < SIDES_EXPLAINED:
+            return []
+        lags.append((lag, sigma))
     apart, sigma = lags[0][0] - lags[1][0], hypot(lags[0][1], lags[1][1])
     if abs(apart) < max(SIDES_TOLD, SIDES_CLEAR * sigma):
         return []
