@@ -242,7 +242,7 @@ WELL_EXPLAINED: Final = 0.5  # least explained share for a small turn and a plac
 FAR_LESS: Final = 0.4  # largest share that a fit explains of another drive, by what the cones show
 SIDES_TOLD: Final = 0.015  # least difference between the lags of both sides that is told (s),
 SIDES_CLEAR: Final = 4.0  # and in standard deviations
-SIDES: Final = 2000, 200  # approximate number of cycles of a side in use, and least number of motions,
+SIDES: Final = 2000, 100  # approximate number of cycles of a side in use, and least number of motions,
 SIDES_EXPLAINED: Final = 0.4  # of which at least this share is explained: of points of lines it is 0.3
 FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation (degrees) and whether mirrored
     (180, False): ("the sensor's frame has x to the rear and y to the right", "-x", "-y"),

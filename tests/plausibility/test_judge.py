@@ -10,13 +10,16 @@ import pytest
 from pathspace_graph import hints
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
+from pathspace_graph.io.overrides import override
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.plausibility.judge import positions_in_metres
+from pathspace_graph.sim.simulate import preset, simulate
+from pathspace_graph.sim.track_generator import generate_track
 
 from ..scenes.drives import ahead, corridor, detections, exact_log, short_drive
 from ..scenes.lines import line_drive
 from .good_logs import EDITED, PRESET, SIMULATED, good_log
-from .mistakes import MISTAKES, causes_of, in_frame, late, with_cycles, with_points, with_twists
+from .mistakes import MISTAKES, causes_of, in_frame, late, side_late, with_cycles, with_points, with_twists
 
 SAID = {
     "positions in millimetres": ("in millimetres", "multiply x and y by 0.001"),
@@ -302,3 +305,12 @@ def test_a_small_step_of_the_clock_is_told_by_its_size() -> None:
     log = short_drive()
     (found,) = hints(late(log, 0.3, float(log.odometry.t.mean())))
     assert "the clock of one file jumps or drifts, by 0.3 s about" in found.likely
+
+
+def test_two_cameras_that_disagree_in_time_are_no_sensor_of_lines() -> None:
+    """At five cycles a second and with their noise, a lap's cones are not met where they were."""
+    settings = override(preset({"sensor": "camera"}), {"laps": 1}, "")
+    log = side_late(simulate(generate_track(np.random.default_rng(1)), settings, 1), 0.05)
+    (found,) = hints(log)
+    assert found.cause == "sides"
+    assert 35.0 < float(found.likely.split("by ")[1].split(" ms")[0]) < 65.0
