@@ -53,7 +53,7 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
 
 
 def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield all factors without control points: odometry, revisits, first pose and priors of calibrations."""
+    """Yield all factors without control points, those of the user last."""
     for k, interval in enumerate(system.chain.odometry.intervals):
         yield odometry_factor(k, interval)
     for one in system.revisits:
@@ -76,6 +76,7 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
     if sensor_key is not None:
         sigmas = noises.Diagonal.Sigmas(np.array(calibration.sigmas))
         yield gtsam.PriorFactorVector(sensor_key, np.array(calibration.means), sigmas)
+    yield from system.own
 
 
 def _priors(gauge: CurveGauge, state: State) -> Iterator[gtsam.NonlinearFactor]:

@@ -19,10 +19,14 @@ from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
 from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    SENSOR_KEY,
     Layout,
     are_poses,
     pose_key,
+    pose_keys,
 )
+from pathspace_graph.graph.window import check_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, joint_covariance
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult, VehicleState
@@ -135,29 +139,41 @@ class BatchMapper:
         known_noise(odometry_sigma)  # check it early
 
     def solve(
-        self, log: Log, start: Start | None = None, on_round: Callable[[], None] | None = None
+        self,
+        log: Log,
+        start: Start | None = None,
+        on_round: Callable[[], None] | None = None,
+        factors: Sequence[gtsam.NonlinearFactor] = (),
     ) -> BatchResult:
         """Search the optimum, from odometry alone or from an online map.
 
-        `start` is by default `batch.start` of the settings. `on_round` is called after each round.
-        SettingsError if the start needs an online mapper and there is none, SolveError if the log does not
-        determine an optimum.
+        `start` is by default `batch.start` of the settings. `on_round` is called after each round. `factors`
+        are GTSAM factors of your own on the poses of cycles (`graph.variables:pose_key`, `Pose2`) and on the
+        calibrations, as `BatchResult.values` has them. They are linearized at every step, and `graph` has
+        them. SettingsError for other keys, or if the start needs an online mapper and there is none;
+        SolveError if the log does not determine an optimum.
         """
         settings = self.settings.with_kind(log.sensor.kind)
-        return solved(partial(self._solve, settings, start, on_round), log)
+        calibrations = [CALIBRATION_KEY, *([SENSOR_KEY] if settings.calibration.sensor else [])]
+        known = np.append(calibrations, pose_keys(np.arange(len(log.cycles))))
+        expected = f"poses, x0 to x{len(log.cycles) - 1}, and of the calibrations"
+        check_keys(factors, known, expected)
+        return solved(partial(self._solve, settings, start, on_round, tuple(factors)), log)
 
     def _solve(
         self,
         settings: MapperSettings,
         start: Start | None,
         on_round: Callable[[], None] | None,
+        factors: Sequence[gtsam.NonlinearFactor],
         log: Log,
     ) -> BatchResult:
         watch, noise = Stopwatch(), known_noise(self.odometry_sigma)
         judged = judge_log(log, noise, own_settings(settings))
         watch.lap("integrate")
         start = start or settings.batch.start
-        begun, online = self._search(log, judged, settings, noise, start, on_round, watch)
+        optimizer = partial(_optimizer, judged, on_round, factors)
+        begun, online = self._search(log, judged, settings, noise, start, optimizer, watch)
         found, known = with_wider_priors(begun)
         watch.lap("optimum")
         solved_map = map_of(found, known, _orange(judged, found.at.state), watch)
@@ -179,16 +195,16 @@ class BatchMapper:
         settings: MapperSettings,
         noise: KnownNoise,
         start: Start,
-        on_round: Callable[[], None] | None,
+        optimizer_with: Callable[[Sequence[Revisit]], Optimizer],
         watch: Stopwatch,
     ) -> tuple[Found, RunResult | None]:
         """Return the optimum, and the online run in which the search began, if any."""
         revisits: Sequence[Revisit] = ()
         if start != "online":
             revisits = find_revisits(judged)
-            found = find_closed_optimum(_optimizer(judged, on_round, revisits))
+            found = find_closed_optimum(optimizer_with(revisits))
             if found is None and start == "odometry":
-                found = find_from_odometry(_optimizer(judged, on_round))
+                found = find_from_odometry(optimizer_with(()))
             if found is not None:
                 return found, None
         if self.online is None:
@@ -199,19 +215,23 @@ class BatchMapper:
         watch.lap("start")
         found = None
         if start == "auto" and not revisits:
-            found = find_closed_optimum(_optimizer(judged, on_round, mapper.closed_by))
+            found = find_closed_optimum(optimizer_with(mapper.closed_by))
         if found is None:
-            optimizer = _optimizer(judged, on_round, mapper.revisits)
+            optimizer = optimizer_with(mapper.revisits)
             found = Found(optimizer, *optimizer.find(state))
         return found, online
 
 
 def _optimizer(
-    judged: JudgedLog, on_round: Callable[[], None] | None, revisits: Sequence[Revisit] = ()
+    judged: JudgedLog,
+    on_round: Callable[[], None] | None,
+    factors: Sequence[gtsam.NonlinearFactor],
+    revisits: Sequence[Revisit],
 ) -> Optimizer:
     """Make an optimizer with a system and detections of its own, independent of other searches."""
     detections = DetectionTable.of(judged.cycles, twists=judged.chain.twists)
-    return Optimizer(BatchSystem(detections, judged.chain, judged.settings, revisits), on_round=on_round)
+    system = BatchSystem(detections, judged.chain, judged.settings, revisits, own=factors)
+    return Optimizer(system, on_round=on_round)
 
 
 def find_from_odometry(optimizer: Optimizer) -> Found:

@@ -14,6 +14,7 @@ from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
 from pathspace_graph.graph.rows import Revisit, Rows, at_values, by_widths, revisit_rows
 from pathspace_graph.graph.variables import POINT, Layout, are_poses, pose_keys
+from pathspace_graph.graph.window import rows_on_poses
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.detection_rows import NO_ROWS, DetectionRows, rows_across
 from pathspace_graph.mapping.detections import DetectionTable
@@ -152,6 +153,7 @@ class BatchSystem:
         settings: MapperSettings,
         revisits: Sequence[Revisit] = (),
         factors: Sequence[Rows] = (),
+        own: Sequence[gtsam.NonlinearFactor] = (),
     ) -> None:
         self.detections = detections
         self.chain = chain
@@ -159,6 +161,7 @@ class BatchSystem:
         self.priors = [settings]  # settings of each drive, for the priors of its calibrations
         self.revisits = tuple(revisits)  # relative poses of cycles on the same road
         self.factors = by_widths(factors)  # the user's factors, at values of zero
+        self.own = tuple(own)  # the user's factors on poses and calibrations, linearized at every step
         self.kernel = Biweight(LOOSE_GATE)
         self.gauges: dict[int, CurveGauge] = {}  # of each boundary
         self.matches: StationMatches | None = None  # stations of closed curves, if they are used
@@ -193,7 +196,8 @@ class BatchSystem:
         derivative.
         """
         drive = self.drive_rows(state) + revisit_rows(self.revisits, state.poses)
-        drive += [at_values(rows, state.variables) for rows in self.factors]
+        own = by_widths(rows_on_poses(self.own, state.variables) or ())
+        drive += [at_values(rows, state.variables) for rows in (*self.factors, *own)]
         across, u = self._across(state, hold) if state.boundaries else (NO_ROWS, np.zeros(0))
         along = self._along(state, self.matches) if self.matches else NO_ROWS
         unused = len(self.detections) - int(np.isfinite(across.sigma).sum())

@@ -18,6 +18,7 @@ from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.linear import keys_of_factor
 from pathspace_graph.factors.odometry import IntegratedOdometry
 
+from .elimination import owners
 from .gaussian import graph_of, jacobian_factor, normal_equations, square_root_form
 from .rows import OdometryChain, Rows, among, at_reference, factor_of_block, jacobian_factors, stacked_factor
 from .variables import (
@@ -29,6 +30,7 @@ from .variables import (
     Layout,
     Variables,
     are_poses,
+    indices,
     name,
     pose_key,
     rotation_blocks,
@@ -275,12 +277,10 @@ class UserFactors:
         return taken
 
 
-def rows_on_poses(
-    factors: Sequence[gtsam.NonlinearFactor], variables: Variables, cycle: int
-) -> list[Rows] | None:
+def rows_on_poses(factors: Sequence[gtsam.NonlinearFactor], variables: Variables) -> list[Rows] | None:
     """Return user's factors on poses and calibrations as rows at values of zero, linearized now.
 
-    None where one holds points of the map, which are others in a batch. The rows are owned by the cycle.
+    None where one holds points of the map, which are others in a batch. Its first pose owns the rows.
     """
     found = []
     for linear in _linear(factors, variables):
@@ -288,12 +288,24 @@ def rows_on_poses(
         if not (are_poses(keys) | np.isin(keys, variables.calibration_keys)).all():
             return None
         residual = -np.ravel(b) - A @ variables.reference[variables.layout.entries(keys)]
-        found.append(Rows(np.tile(keys, (len(A), 1)), np.array(A), residual, np.full(len(A), cycle)))
+        cycles = np.append(indices(keys[are_poses(keys)]), 0)  # of its poses; none of the calibration alone
+        owner = np.repeat(owners(cycles[:1]), len(A))
+        found.append(Rows(np.tile(keys, (len(A), 1)), np.array(A), residual, owner))
     return found
 
 
 def _holds_pose(factor: gtsam.NonlinearFactor) -> bool:
     return bool(are_poses(keys_of_factor(factor)).any())
+
+
+def check_keys(factors: Sequence[gtsam.NonlinearFactor], known: IntArray, expected: str) -> None:
+    """Raise a SettingsError for the first factor that is not one, or that holds another key than `known`."""
+    for row, factor in enumerate(factors):
+        if not isinstance(factor, gtsam.NonlinearFactor):
+            raise _unusable(row, "a gtsam.NonlinearFactor", type(factor).__name__)
+        unknown = np.setdiff1d(keys_of_factor(factor), known)
+        if len(unknown):
+            raise _unusable(row, f"keys of {expected}", name(int(unknown[0])))
 
 
 def check_factors(factors: Sequence[gtsam.NonlinearFactor], variables: Variables, next_cycle: int) -> None:
@@ -308,13 +320,8 @@ def check_factors(factors: Sequence[gtsam.NonlinearFactor], variables: Variables
     expected = (
         f"poses in the window, {name(first)} to {name(following)}, of control points and of the calibration"
     )
+    check_keys(factors, keys_known, expected)
     for row, factor in enumerate(factors):
-        if not isinstance(factor, gtsam.NonlinearFactor):
-            raise _unusable(row, "a gtsam.NonlinearFactor", type(factor).__name__)
-        keys = keys_of_factor(factor)
-        unknown = keys[~np.isin(keys, keys_known)]
-        if len(unknown):
-            raise _unusable(row, f"keys of {expected}", name(int(unknown[0])))
         try:
             linear = factor.linearize(values_of(factor, next_cycle, variables))
         except Exception as error:  # whatever a user's own function raises, or GTSAM where types differ

@@ -78,7 +78,7 @@ class Road:
 
     def rows_of(self, factors: Sequence[gtsam.NonlinearFactor]) -> list[Rows] | None:
         """Convert the user's factors on poses to rows for a batch; None if one is on points of the map."""
-        return rows_on_poses(factors, self.smoother.variables, self.next_cycle - 1)
+        return rows_on_poses(factors, self.smoother.variables)
 
     def predict(self, motion: MeasuredMotion, orange: Detections) -> None:
         """Add the pose of a cycle by the calibrated odometry, extend the path, and keep the orange cones."""
