@@ -9,7 +9,8 @@ from .arrays import Array
 from .se2 import se2_exp
 
 MIN_SIGMA = 1e-6  # of integrated odometry (m, rad); keeps the factor of an empty interval finite
-CALIBRATION_SIZE = 2  # entries of the calibration: scale error of the speeds (-), yaw-rate bias (rad/s)
+CALIBRATION = ("scale", "bias")  # scale error of the speeds (-), yaw-rate bias (rad/s)
+CALIBRATION_SIZE = len(CALIBRATION)
 
 
 @dataclass(frozen=True)

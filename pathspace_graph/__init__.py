@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, read_map
     from pathspace_graph.io.results import CycleRecord, RunResult, write_result
     from pathspace_graph.online.fixed_lag import FixedLagMapper
-    from pathspace_graph.plausibility.hint import Hint
-    from pathspace_graph.plausibility.judge import hints
+    from pathspace_graph.plausibility.judge import Hint, hints
     from pathspace_graph.settings.mapper import MapperSettings
     from pathspace_graph.spline.bspline import BSpline
 
@@ -50,8 +49,7 @@ _HOMES = {
     "baselines.landmark_batch": ("LandmarkBatch",),
     "baselines.landmark_fixed_lag": ("LandmarkFixedLag",),
     "online.fixed_lag": ("FixedLagMapper",),
-    "plausibility.hint": ("Hint",),
-    "plausibility.judge": ("hints",),
+    "plausibility.judge": ("Hint", "hints"),
     "run": ("run_online", "split_odometry"),
     "settings.mapper": ("MapperSettings",),
     "spline.bspline": ("BSpline",),

@@ -29,7 +29,7 @@ PARAMETER: Final = cyclopts.Parameter(
 WHOLE: Final = re.compile(r"[+-]?\d{1,18}|none", re.IGNORECASE)  # cyclopts would round any other number
 
 
-class Command(NamedTuple):
+class Entry(NamedTuple):
     """Where a command is: imported only after its name is known, so that help need not wait for GTSAM."""
 
     options: str  # module of `options` and dataclass in it
@@ -39,22 +39,22 @@ class Command(NamedTuple):
 
 GROUPS: Final = {
     "Maps": {
-        "demo": Command("map:Demo", "compare", "Map a generated track online: a table, a map, its picture."),
-        "online": Command("map:Online", "estimate", "Map a log online, cycle by cycle."),
-        "batch": Command("map:Batch", "estimate", "Optimize whole logs at once, as the ground reference."),
-        "plot": Command("map:Plot", "plot", "Draw a map with its uncertainty band."),
-        "export": Command("map:Export", "export", "Write a map as planners and other tools read it."),
+        "demo": Entry("runs:Demo", "compare", "Map a generated track online: a table, a map, its picture."),
+        "online": Entry("runs:Online", "estimate", "Map a log online, cycle by cycle."),
+        "batch": Entry("runs:Batch", "estimate", "Optimize whole logs at once, as the ground reference."),
+        "plot": Entry("runs:Plot", "plot", "Draw a map with its uncertainty band."),
+        "export": Entry("runs:Export", "export", "Write a map as planners and other tools read it."),
     },
     "Data": {
-        "simulate": Command("data:Simulate", "simulate", "Write the log of a simulated drive, with truth."),
-        "convert": Command("data:Convert", "convert", "Write a ROS bag, CSV files or JSON lines as a log."),
+        "simulate": Entry("data:Simulate", "simulate", "Write the log of a simulated drive, with truth."),
+        "convert": Entry("data:Convert", "convert", "Write a ROS bag, CSV files or JSON lines as a log."),
     },
     "Studies": {
-        "compare": Command("study:Compare", "compare", "Run every estimator on logs: the paper's table."),
-        "ablate": Command("study:Ablate", "studies", "Run a study of estimators and settings."),
-        "faults": Command("study:FaultSuite", "studies", "Measure what each fault of a car costs."),
-        "scale": Command("study:Scale", "studies", "Measure update time against map size."),
-        "report": Command("study:Report", "studies", "Measure the figures of the pages."),
+        "compare": Entry("runs:Compare", "compare", "Run every estimator on logs: the paper's table."),
+        "ablate": Entry("runs:Ablate", "studies", "Run a study of estimators and settings."),
+        "faults": Entry("runs:FaultSuite", "studies", "Measure what each fault of a car costs."),
+        "scale": Entry("runs:Scale", "studies", "Measure update time against map size."),
+        "report": Entry("runs:Report", "studies", "Measure the figures of the pages."),
     },
 }
 EXTRAS: Final = {  # packages that the core does without, and the extra that has them

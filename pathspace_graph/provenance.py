@@ -37,7 +37,7 @@ def machine() -> dict[str, str]:
 
 @cache
 def commit_of(folder: Path | None) -> str:
-    """Return the short hash of the commit that is checked out, with `+` where something differs from it.
+    """Short hash of the commit that is checked out, with `+` where something differs from it.
 
     It is empty where there is none.
     """

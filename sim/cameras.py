@@ -62,7 +62,6 @@ to 0.03 rad off. The correlation time is assumed.
 INS_RATE: Final = 40.0  # rate of the INS (Hz)
 
 SOME: Final = 0.5  # share of the drawn cars that have a fault that not every car has
-TURNED: Final = 0.25  # share of those whose sensor is mounted badly
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,8 @@ def draw_sensor(rng: Generator) -> SensorSettings:
 
 def draw_sensor_faults(rng: Generator) -> SensorFaults:
     """Draw constant errors of a detector against the odometry."""
-    yaw = radians(rng.uniform(3.0, 7.0)) if rng.random() < TURNED else radians(rng.uniform(0.0, 1.5))
+    # the sensor of one in four is mounted badly
+    yaw = radians(rng.uniform(3.0, 7.0)) if rng.random() < 0.25 else radians(rng.uniform(0.0, 1.5))
     return SensorFaults(
         # stamps of the exposure and of the odometry's receipt make early ones, those of the result late ones
         latency=rng.uniform(-0.15, 0.15),

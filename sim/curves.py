@@ -50,16 +50,14 @@ def curvature(first: Array, second: Array) -> Array:
 
 
 STEP: Final = 0.25  # distance of the samples of a curve that is fitted (m)
-KNOT_STEP: Final = 0.5  # distance of the knots of the finished curve (m)
 SMOOTHING: Final = 1.0  # sigma of the Gaussian (m), which cuts a corner of radius R by its square / 2R
-CENTRINGS: Final = 4  # times that the curve is moved to equal distances from both rows and smoothed
 NEIGHBOURS: Final = 3  # cones to both sides of a sample's, up to which its distance to a row is measured
 START_CANDIDATES: Final = 4  # cones of each row nearest to the start, tried as the first pair
 
 
 @dataclass(frozen=True, eq=False)
-class CentreLine:
-    """A twice differentiable curve `c(s)` by arc length `s`, periodic where the track is closed."""
+class SmoothCurve:
+    """A twice differentiable curve `c(s)` by arc length `s`, periodic where it is closed."""
 
     spline: CubicSpline  # points (2,) in m by s, which is the arc length to about 0.1 %
     length: float  # length of the curve, or of one lap (m)
@@ -71,6 +69,10 @@ class CentreLine:
 
     def tangents(self, s: Array) -> Array:
         return unit(np.asarray(self.spline(s, 1)))
+
+    def normals(self, s: Array) -> Array:
+        """Unit normals (n, 2) to the left."""
+        return left_normals(self.tangents(s))
 
     def curvatures(self, s: Array) -> Array:
         return curvature(np.asarray(self.spline(s, 1)), np.asarray(self.spline(s, 2)))
@@ -87,7 +89,7 @@ class CentreLine:
         return float(s[np.argmin(np.where(ahead > 0, distances, np.inf))])
 
 
-def fit_centre_line(left: Array, right: Array, closed: bool, near: Array) -> CentreLine:
+def fit_centre_line(left: Array, right: Array, closed: bool, near: Array) -> SmoothCurve:
     """Fit the curve halfway between two rows of cones (n, 2) and (m, 2) in driving order.
 
     The rows are matched from `near` on by the triangulation of least total squared width along both.
@@ -101,13 +103,13 @@ def fit_centre_line(left: Array, right: Array, closed: bool, near: Array) -> Cen
     def distances(curve: Array) -> list[Array]:
         return [_row_distances(curve, row, k, closed) for row, k in zip((left, right), index, strict=True)]
 
-    for _ in range(CENTRINGS):
+    for _ in range(4):  # moved to equal distances from both rows, and smoothed
         to_left, to_right = distances(curve)
         curve = _smooth(curve + _normals(curve, closed) * (to_left - to_right)[:, None] / 2, closed)
     return _as_spline(curve, np.minimum(*distances(curve)), closed)
 
 
-def along_path(points: Array, cones: Array, closed: bool) -> CentreLine:
+def along_path(points: Array, cones: Array, closed: bool) -> SmoothCurve:
     """Fit a smooth curve along points (k, 2), whose clearance is the distance to the nearest cone."""
     curve = _smooth(resample(points, STEP, closed)[0], closed)
     return _as_spline(curve, np.asarray(scipy.spatial.KDTree(cones).query(curve)[0]), closed)
@@ -180,11 +182,11 @@ def _row_distances(curve: Array, row: Array, index: IntArray, closed: bool) -> A
     return np.asarray(np.linalg.norm(a + part[..., None] * along - curve[:, None], axis=-1).min(axis=1))
 
 
-def _as_spline(curve: Array, clearance: Array, closed: bool) -> CentreLine:
-    knots, index = resample(curve, KNOT_STEP, closed)
+def _as_spline(curve: Array, clearance: Array, closed: bool) -> SmoothCurve:
+    knots, index = resample(curve, 0.5, closed)
     at_knots = np.interp(index, np.arange(len(curve)), clearance)
     if closed:
         knots, at_knots = ring(knots), np.append(at_knots, at_knots[0])
     s = arc_lengths(knots)
     spline = scipy.interpolate.CubicSpline(s, knots, bc_type="periodic" if closed else "not-a-knot")
-    return CentreLine(spline, float(s[-1]), closed, at_knots)
+    return SmoothCurve(spline, float(s[-1]), closed, at_knots)

@@ -15,14 +15,12 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.checked import AT_LEAST_0, AtLeast0, Checked
 
-from .curves import STEP, arc_lengths, direction, left_normals, ring, unit
+from .curves import STEP, SmoothCurve, arc_lengths, direction, left_normals, ring
 from .sensor import SensorSettings, false_positives, polar_detections, seen_from
 from .track import Track
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
-
-TRUE_SPACING: Final = 1.0  # greatest distance of the points of a true boundary (m)
 
 
 @dataclass(frozen=True)
@@ -49,25 +47,12 @@ LINE: Final = SensorSettings(
 """Range, field and noise of the plain sensor; 1 % of the points are clutter where they are 1 m apart."""
 
 
-class BoundaryCurve:
-    """The smooth curve through the points (n, 2) of a boundary in driving order, by its arc length."""
-
-    def __init__(self, points: Array, closed: bool) -> None:
-        by_chord = _through(points, closed)
-        s = np.linspace(0.0, by_chord.x[-1], int(np.ceil(by_chord.x[-1] / STEP)) + 1)
-        self._spline = _through(np.asarray(by_chord(s))[: len(s) - closed], closed)
-        self._closed = closed
-        self.length = float(self._spline.x[-1])
-
-    def points(self, s: Array) -> Array:
-        return np.asarray(self._spline(s))
-
-    def normals(self, s: Array) -> Array:
-        return left_normals(unit(np.asarray(self._spline(s, 1))))
-
-    def beyond(self, s: Array, begin: float) -> Array:
-        """Distances (m,) of places `s` beyond `begin`, round a closed curve; negative before it."""
-        return (s - begin) % self.length if self._closed else s - begin
+def curve_through(points: Array, closed: bool) -> SmoothCurve:
+    """Smooth curve through the points (n, 2) of a boundary in driving order, by its arc length."""
+    by_chord = _through(points, closed)
+    s = np.linspace(0.0, by_chord.x[-1], int(np.ceil(by_chord.x[-1] / STEP)) + 1)
+    spline = _through(np.asarray(by_chord(s))[: len(s) - closed], closed)
+    return SmoothCurve(spline, float(spline.x[-1]), closed, np.zeros(len(spline.x)))
 
 
 def _through(points: Array, closed: bool) -> CubicSpline:
@@ -84,8 +69,8 @@ def as_lines(track: Track) -> Track:
         raise SettingsError(f"line.spacing: expected a track between two boundaries, found the {track.name}")
     rows = []
     for cones in (track.left, track.right):
-        curve = BoundaryCurve(cones, track.closed)
-        count = int(np.ceil(curve.length / TRUE_SPACING))
+        curve = curve_through(cones, track.closed)
+        count = int(np.ceil(curve.length))  # points are a metre apart at most
         rows.append(curve.points(np.linspace(0.0, curve.length, count + 1)[: count + (not track.closed)]))
     return replace(track, left=rows[0], right=rows[1], other=np.zeros((0, 2)), other_labels=None)
 
@@ -104,7 +89,7 @@ class LineSensor:
         """Take a track of `as_lines` in the map frame, and the label of each of its points."""
         gap_rng, self._place_rng, self._noise_rng, self._false_rng, self._drop_rng = rng.spawn(5)
         self._settings, self._line, self._labels = settings, line, labels
-        self._curves = [BoundaryCurve(row, track.closed) for row in (track.left, track.right)]
+        self._curves = [curve_through(row, track.closed) for row in (track.left, track.right)]
         self._counts = (len(track.left), len(track.right))
         sides = gap_rng.integers(0, len(self._curves), line.gaps)
         self.gaps = [(int(side), float(gap_rng.uniform(0.0, self._curves[side].length))) for side in sides]
@@ -155,7 +140,7 @@ class LineSensor:
             count = int(self._place_rng.poisson(curve.length / self._line.spacing))
             s = self._place_rng.uniform(0.0, curve.length, count)
             for gap_side, begin in self.gaps:
-                beyond = curve.beyond(s, begin)
+                beyond = (s - begin) % curve.length if curve.closed else s - begin
                 s = s[(side != gap_side) | (beyond < 0.0) | (beyond >= self._line.gap_length)]
             share = s / curve.length
             nearest = np.rint(share * self._counts[side]).astype(int) % self._counts[side]

@@ -9,8 +9,7 @@ from numpy.random import Generator
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.io.covariances import polar_covariances
-from pathspace_graph.io.log import Detections
+from pathspace_graph.io.log import Detections, polar_covariances
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.settings.checked import AT_LEAST_0, POSITIVE, AtLeast0, Checked, Share, Signed
 

@@ -11,8 +11,15 @@ from numpy.random import Generator
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.sensor import SENSOR
-from pathspace_graph.io.covariances import SIGMA_DETECTIONS, ray_covariances
-from pathspace_graph.io.log import SIGMA_ODOMETRY, Detections, Log, SensorInfo, Truth
+from pathspace_graph.io.log import (
+    SIGMA_DETECTIONS,
+    SIGMA_ODOMETRY,
+    Detections,
+    Log,
+    SensorInfo,
+    Truth,
+    ray_covariances,
+)
 from pathspace_graph.io.overrides import leaves
 from pathspace_graph.labels import NAMES, UNKNOWN
 from pathspace_graph.lengths import scaled
@@ -152,7 +159,7 @@ def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
 
 
 def _noise(settings: SimulationSettings) -> Array | None:
-    """Noise (6,) in the order of `io.header:TRUE_ERRORS`, or None where all of it is white."""
+    """Noise (6,) in the order of `io.log_files:TRUE_ERRORS`, or None where all of it is white."""
     odometry, sensor = settings.odometry, settings.sensor
     if not (any(odometry.slow) or sensor.slow_range or sensor.slow_bearing):
         return None

@@ -11,7 +11,7 @@ from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
 from . import curves
-from .curves import CentreLine, direction, left_normals
+from .curves import SmoothCurve, direction, left_normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Track:
     path: Array | None = None  # (k, 2) along which the road is driven, if not its middle (m)
 
     @cached_property
-    def centre_line(self) -> CentreLine:
+    def centre_line(self) -> SmoothCurve:
         """The smooth curve halfway between the boundaries, or along the path, track frame."""
         if self.path is not None:
             return curves.along_path(self.path, np.vstack([self.left, self.right]), self.closed)

@@ -3,7 +3,7 @@
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -24,14 +24,8 @@ from .curves import arc_lengths, direction, left_normals, resample, ring, unit
 from .track import Track
 
 MIN_CONES: Final = 3  # least number of cones of a boundary
-DUPLICATE_DISTANCE: Final = 0.3  # distance below which two surveyed cones of one colour are one (m)
 REPEAT_DISTANCE: Final = 0.01  # distance below which a cone of an ordered row is the one before again (m)
-MAX_UNPLACED: Final = 0.2  # largest share of stray cones, which belong to no lane
-MAX_START_DISTANCE: Final = 10.0  # largest distance of the start from the middle of the track (m)
-CONE_SPACING: Final = 5.0  # largest distance of cones along a circuit that is given by its widths (m)
 ORANGE: Final = "orange"  # part of PacSim's classes of cones of no boundary
-INVISIBLE: Final = "invisible"  # PacSim's class of cones that are not detected
-MIN_CLEARANCE: Final = 0.2  # least distance of the middle of a road from a cone, as a share of the usual one
 WIDTH_STEP: Final = 0.5  # distance of samples of a circuit (m)
 TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # centre line and widths
 EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
@@ -84,13 +78,13 @@ def _check(path: Path, track: Track) -> None:
             raise InputError(path, f"{expected}, found {len(row)}")
     line = track.centre_line
     least, usual = line.clearance.min(), np.median(line.clearance)
-    if least < MIN_CLEARANCE * usual:
+    if least < 0.2 * usual:
         found = f"found their middle {least:.2f} m from a cone where the road is {2.0 * usual:.1f} m wide"
         raise InputError(path, f"expected two rows with a road between them, {found}")
     s = np.arange(0.0, line.length, WIDTH_STEP)
     distances = np.linalg.norm(line.points(s) - track.start[:2], axis=1)
     nearest = int(np.argmin(distances))
-    if distances[nearest] > MAX_START_DISTANCE:
+    if distances[nearest] > 10.0:
         found = f"found it {distances[nearest]:.1f} m from its middle"
         raise InputError(path, f"expected the start on the track, {found}")
     if line.tangents(s[nearest : nearest + 1])[0] @ direction(track.start[2]) <= 0:
@@ -148,18 +142,13 @@ def _pacsim(path: Path, content: Any) -> Track:
     points = _points([cone.position for cones in lists for cone in cones])
     kinds = np.array([str(cone.kind) for cones in lists for cone in cones], str)
     row = np.repeat(np.arange(3), [*map(len, lists)])  # of which list: of no boundary, left or right
-    orange, hidden = np.char.find(kinds, ORANGE) >= 0, (kinds == INVISIBLE) & (row > 0)
+    orange = np.char.find(kinds, ORANGE) >= 0
     labels = np.where(np.char.find(kinds, "big") >= 0, BIG_ORANGE, SMALL_ORANGE)
     labels = np.where(orange, labels, UNKNOWN)
     left, right = (_without_repeats(points[(row == k) & ~orange], data.closed) for k in (1, 2))
     start = np.array([*data.start.position[:2], data.start.orientation[2]])
     no_boundary = orange | (row == 0)
-    track = Track(left, right, points[no_boundary], data.closed, start, path.stem, labels[no_boundary])
-    if not hidden.any():
-        return track
-    seen = (cones[~(cones[:, None] == points[hidden]).all(axis=2).any(axis=1)] for cones in (left, right))
-    s = np.arange(0.0, track.centre_line.length, WIDTH_STEP)
-    return replace(track, **dict(zip(("left", "right"), seen, strict=True)), path=track.centre_line.points(s))
+    return Track(left, right, points[no_boundary], data.closed, start, path.stem, labels[no_boundary])
 
 
 def _fssim(path: Path, content: Any) -> Track:
@@ -202,7 +191,7 @@ def _eufs(table: Table) -> Track:
     start = _eufs_start(table, tags, points, left, right)
     order = driving_order(left, right, points[tags == "big_orange"], start)
     count, placed = len(left) + len(right), 0 if order is None else len(order.left) + len(order.right)
-    if order is None or placed < (1 - MAX_UNPLACED) * count:
+    if order is None or placed < 0.8 * count:  # the others are strays
         found = f"found {count - placed} of {count} cones off it"
         raise InputError(path, f"expected one lane from the start on, {found}")
     others += [np.delete(left, order.left, axis=0), np.delete(right, order.right, axis=0)]
@@ -227,10 +216,10 @@ def _eufs_start(table: Table, tags: NDArray[np.str_], points: Array, left: Array
 
 
 def _without_duplicates(cones: Array) -> Array:
-    """Drop cones (n, 2) within the duplicate distance of one kept before."""
+    """Drop cones (n, 2) within 0.3 m of one kept before, which is the same cone surveyed twice."""
     kept, count = np.empty_like(cones), 0
     for cone in cones:
-        if (np.linalg.norm(kept[:count] - cone, axis=1) >= DUPLICATE_DISTANCE).all():
+        if (np.linalg.norm(kept[:count] - cone, axis=1) >= 0.3).all():
             kept[count] = cone
             count += 1
     return kept[:count]
@@ -246,7 +235,7 @@ def _tum(table: Table) -> Track:
         points + side * left_normals(tangents) * np.interp(s, knots, circuit[:, k])[:, None]
         for side, k in ((-1.0, 2), (1.0, 3))
     )
-    right, left = (resample(edge, CONE_SPACING, closed=True)[0] for edge in edges)
+    right, left = (resample(edge, 5.0, closed=True)[0] for edge in edges)
     start = np.append(circuit[0, :2], math.atan2(tangents[0, 1], tangents[0, 0]))
     return Track(left, right, np.zeros((0, 2)), True, start, table.file.stem)
 
@@ -270,8 +259,6 @@ def _tum_circuit(table: Table) -> Array:
 # --- driving order of cones: a walk along the lane, triangle by triangle ----------------------------------
 
 RUNG_MAX: Final = 12.0  # largest distance of a left and a right cone of one lane (m)
-GATE_REACH: Final = 12.0  # from the start, within which gate cones stand in for missing ones (m)
-INSERTION_DETOUR: Final = 5.0  # growth of a row up to which a missed cone joins it (m)
 
 Rung = tuple[int, int]
 Apexes = Mapping[Rung, Sequence[int]]
@@ -301,7 +288,8 @@ def driving_order(left: Array, right: Array, gate: Array, start: Array) -> Drivi
 
 def _order(left: Array, right: Array, gate: Array, start: Array) -> DrivingOrder | None:
     step = gate - start[:2]
-    near, side = np.linalg.norm(step, axis=1) < GATE_REACH, step @ left_normals(direction(start[2]))
+    # gate cones stand in for missing ones near the start
+    near, side = np.linalg.norm(step, axis=1) < 12.0, step @ left_normals(direction(start[2]))
     gate_left, gate_right = gate[near & (side > 0)], gate[near & (side <= 0)]
     points = np.vstack([left, gate_left, right, gate_right])
     split, right_end = len(left) + len(gate_left), len(left) + len(gate_left) + len(right)
@@ -376,6 +364,6 @@ def _row(cones: Array, walked: list[int], closed: bool) -> IntArray:
         to_cone = np.linalg.norm(polyline - cones[missed], axis=1)
         detour = to_cone[:-1] + to_cone[1:] - np.linalg.norm(np.diff(polyline, axis=0), axis=1)
         place = int(np.argmin(detour))
-        if detour[place] < INSERTION_DETOUR:
+        if detour[place] < 5.0:  # m that the row grows
             row.insert(place + 1, missed)
     return np.array(row, dtype=int)

@@ -13,15 +13,13 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.settings.checked import AtLeast0, Checked, Signed
 
-from .curves import CentreLine, arc_lengths, curvature, direction, left_normals
+from .curves import SmoothCurve, arc_lengths, curvature, direction, left_normals
 from .track import Track
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-PATH_STEP: Final = 0.25  # distance of the samples of the driven path (m)
 WAVES: Final = 8  # number of sines whose sum is the wander
-MIN_PATH: Final = 10  # least number of samples of a path
 
 
 @dataclass(frozen=True)
@@ -124,9 +122,9 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
     total = laps * line.length + settings.overrun if line.closed else line.length - start
     if total <= 0.0:
         raise SettingsError(f"vehicle.overrun: expected a drive, found none of {total:g} m")
-    s = np.linspace(0.0, total, max(int(total / PATH_STEP), MIN_PATH))
+    s = np.linspace(0.0, total, max(int(total / 0.25), 10))
     at = (start + s) % line.length if line.closed else start + s
-    normals = left_normals(line.tangents(at))
+    normals = line.normals(at)
     offset = _wander(s, line.clearances(at), settings, rng) + _settling(line, start, track.start, s, settings)
     points = line.points(at) + normals * offset[:, None]
     points += (track.start[:2] - points[0]) * np.exp(-s / settings.settle_distance)[:, None]
@@ -135,7 +133,7 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
     )
 
 
-def _settling(line: CentreLine, start: float, pose: Array, s: Array, settings: VehicleSettings) -> Array:
+def _settling(line: SmoothCurve, start: float, pose: Array, s: Array, settings: VehicleSettings) -> Array:
     """Lateral offset (n,) that begins with the start pose's offset and slope and dies away."""
     point, tangent = line.points(np.array([start]))[0], line.tangents(np.array([start]))[0]
     normal = left_normals(tangent)

@@ -18,7 +18,7 @@ EXTRAS = {"distributed", "rerun", "rosbags", "builtin_interfaces"} | ROS
 
 LATE = {
     "commands.estimate": {"eval.view.recording", "commands.plot"},
-    "options.map": {"io.overrides"},
+    "options.runs": {"io.overrides"},
     "io.brief": {"eval.figures.map_plot", "frames"},
 }
 """Modules that are imported by name when needed, since matplotlib is slow."""
@@ -168,45 +168,9 @@ def imported_by(node: ast.AST) -> list[str]:
 # --- names -----------------------------------------------------------------------------------------------
 
 TWICE = {
-    *(
-        "CentreLine",
-        "Command",
-        "Crossing",
-        "Drive",
-        "DrivenPath",
-        "Table",
-    ),
-    *(
-        "boundary_points",
-        "check_length",
-        "crossings",
-        "drive",
-        "driving_order",
-        "frame_of",
-    ),
-    *(
-        "in_vehicle",
-        "joint_table",
-        "laps_of",
-        "laps_table",
-        "made",
-        "main",
-    ),
-    *(
-        "map_of",
-        "of_kind",
-        "outcomes",
-        "outline",
-        "report",
-        "rotations",
-    ),
-    *(
-        "sampled",
-        "seen_from",
-        "tell",
-        "thinned",
-        "twist_of",
-    ),
+    *("Crossing", "Drive", "Table"),
+    *("crossings", "drive", "driving_order", "frame_of", "joint_table", "laps_of", "laps_table"),
+    *("made", "main", "outcomes", "rotations", "seen_from", "thinned"),
 }
 """Public functions and classes that still stand in two modules: `main` is an entry point's, the others are
 to be renamed. No name joins them, and a name that stands once is taken off."""

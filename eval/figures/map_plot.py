@@ -12,7 +12,6 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.metrics.accuracy import mapped_points
 from pathspace_graph.eval.metrics.alignment import MapsApart
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
@@ -180,8 +179,7 @@ def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
     Dead reckoning drifts: laps lie beside each other, and the detections of a cone apart.
     """
     odometry, stamps = log.odometry, np.array([cycle.t for cycle in log.cycles])
-    poses = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
-    poses = np.concatenate([np.zeros((1, 3)), poses])
+    poses = odometry.poses()
     with style.figure_context():
         figure = style.Picture(layout="constrained")
         axes = figure.add_subplot()

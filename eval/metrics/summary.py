@@ -18,7 +18,7 @@ from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResul
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
-from pathspace_graph.plausibility.hint import Hint
+from pathspace_graph.plausibility.judge import Hint
 
 from .accuracy import LapMetrics, lap_metrics, root_mean_square, true_lap_ends
 from .consistency import consistency_at_cones

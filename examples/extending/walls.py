@@ -3,7 +3,7 @@ from math import inf
 import numpy as np
 
 from pathspace_graph import Detections, MapperSettings
-from pathspace_graph.io.covariances import ray_covariances
+from pathspace_graph.io.log import ray_covariances
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import CalibrationSettings
 from pathspace_graph.settings.online import MotionSettings

@@ -13,7 +13,7 @@ from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
 from pathspace_graph.eval.experiment import compare as experiment
-from pathspace_graph.eval.experiment.compare import Comparison, compare, side_by_side
+from pathspace_graph.eval.experiment.compare import compare, side_by_side
 from pathspace_graph.eval.experiment.run import check_jobs, run_estimator, unfinished, workers
 from pathspace_graph.eval.figures.map_plot import plot_apart, plot_map
 from pathspace_graph.eval.figures.style import save_plot
@@ -23,8 +23,7 @@ from pathspace_graph.io.files import atomic_folder, check_target, write_json
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import read_map
 from pathspace_graph.io.results import write_result
-from pathspace_graph.options.map import Demo
-from pathspace_graph.options.study import Compare
+from pathspace_graph.options.runs import Compare, Demo
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from .estimate import map_online, outline, tell
@@ -54,11 +53,6 @@ def compare_command(options: Compare) -> Outcome:
             comparison = compare(plan, folder, jobs=options.jobs, on_cell=advance)
         with progress("writing"):
             experiment.write_comparison(options.out, comparison, options.jobs, force=options.force)
-    return report(options.out, comparison)
-
-
-def report(out: Path, comparison: Comparison) -> Outcome:
-    """Print the tables, and return them and what has failed."""
     console = output(wide=True)
     printed = {name: table for name, table in experiment.tables(comparison).items() if name != "metrics"}
     for table in printed.values():
@@ -66,7 +60,7 @@ def report(out: Path, comparison: Comparison) -> Outcome:
         console.print(table.rich())
     note(*(f"{_name(run)}: not converged" for run in comparison.unsettled))
     wrong = [f"{_name(run)}: failed, {run['error']}" for run in comparison.failures]
-    return Outcome([out], {name: table.records() for name, table in printed.items()}, wrong)
+    return Outcome([options.out], {name: table.records() for name, table in printed.items()}, wrong)
 
 
 def _name(names: Mapping[str, str]) -> str:

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pathspace_graph.console import note, progress, say
+from pathspace_graph.console import progress, say
 from pathspace_graph.convert.bag import read_bag
 from pathspace_graph.convert.recording import Recording, rate, to_log, windowed
 from pathspace_graph.convert.settings import LabelRule
@@ -18,14 +18,13 @@ from pathspace_graph.front_end.gate import check_usable
 from pathspace_graph.front_end.noise import measure_noise
 from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.files import check_target
-from pathspace_graph.io.log import DETECTIONS_FILE, LOG_FILE, ODOMETRY_FILE, Log, Odometry
+from pathspace_graph.io.log import LOG_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.options.data import Convert
 from pathspace_graph.plausibility.diagnosis import measured_line
-from pathspace_graph.plausibility.hint import because
-from pathspace_graph.plausibility.judge import hints
+from pathspace_graph.plausibility.judge import because, hints
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
 
@@ -38,11 +37,6 @@ OF_KIND: Final = {  # kinds of records that take an option; any other option is 
     **dict.fromkeys(("odometry", "detections"), ("bag", "csv")),
     **dict.fromkeys(("imu", "wheelbase", "definition", "received", "namespaces", "label_field"), ("bag",)),
     **dict.fromkeys(("columns", "units"), ("csv",)),
-}
-UNITS_OPTION: Final = {  # option of `convert` that mends a cause of a hint about CSV files
-    **{"stamps": "--units time=ms", "positions": "--units length=mm"},
-    **{"speeds": "--units speed=km/h", "yaw rate": "--units yaw_rate=deg/s"},
-    "unexplained": "--units angle=deg",
 }
 
 
@@ -96,29 +90,15 @@ def _convert(options: Convert, source: Path, out: Path) -> None:
         recorded = to_log(record, options.frames, options.noise, source, options.window.spacing)
         log = with_measured_noise(replace(recorded, scale=options.scale), record.parts)
         write_checked(log, out, source, force=options.force)
-    report(record.notes, rule, log)
-    found, mends = hints(log), UNITS_OPTION if options.kind == "csv" else {}
-    for number, hint in enumerate(found):
-        if hint.cause in mends:
-            found[number] = replace(hint, advice=f"{hint.advice} ({mends[hint.cause]})")
-    tell(found)
+    tell_log(record.notes, rule, log)
+    tell(hints(log))
 
 
 def _read(options: Convert, source: Path, rule: LabelRule) -> Recording:
-    if options.kind == "jsonl":
-        return read_json_lines(source, rule, from_poses=options.topics.from_poses, held=options.topics.held)
     if options.kind == "csv":
-        topics = options.topics
-        files = topics.odometry or ODOMETRY_FILE, topics.detections or DETECTIONS_FILE
-        return read_csv(
-            source / files[0],
-            source / files[1],
-            rule,
-            options.columns,
-            options.units,
-            from_poses=topics.from_poses,
-            held=topics.held,
-        )
+        return read_csv(source, options.topics, rule, options.columns, options.units)
+    if options.kind == "jsonl":
+        return read_json_lines(source, options.topics, rule)
     return read_bag(source, options.topics, rule, mounted=options.frames.mounting is not None)
 
 
@@ -166,26 +146,19 @@ def write_checked(log: Log, out: Path, source: Path, *, force: bool) -> None:
         raise InputError(source, f"its log would be refused ({where}): {why}; {part}") from None
 
 
-def report(notes: Counter[str], rule: LabelRule, log: Log) -> None:
-    """Print the meaning of labels, what was dropped or assumed and how often, and a summary of the log."""
-    say(*(f"{count} {text}" for text, count in notes.items() if count))
-    measured = [] if log.measured is None else [measured_line(scaled(log.measured, 1.0 / log.scale))]
-    labels = [rule.summary()] if rule.met else []
-    if hint := rule.hint():
-        note(f"hint: {hint}")
-    say(*labels, outline(log), *measured, describe(log))
-
-
-def outline(log: Log) -> str:
-    """One line about the log: rates, speeds, ranges and labels."""
+def tell_log(notes: Counter[str], rule: LabelRule, log: Log) -> None:
+    """Print what was dropped or assumed and how often, labels, rates, speeds, ranges and the length."""
     twists, seconds = log.odometry.twist, float(np.ptp(log.odometry.t))
     ranges = np.concatenate([np.hypot(*cycle.points_vehicle.T) for cycle in log.cycles])
     labels = np.bincount(np.concatenate([cycle.labels for cycle in log.cycles]), minlength=len(NAMES))
-    counted = ", ".join(
-        f"{count} {name}" for name, count in zip(NAMES, labels.tolist(), strict=True) if count
-    )
-    return (
+    counted = [f"{count} {name}" for name, count in zip(NAMES, labels.tolist(), strict=True) if count]
+    measured = [] if log.measured is None else [measured_line(scaled(log.measured, 1.0 / log.scale))]
+    say(
+        *(f"{count} {text}" for text, count in notes.items() if count),
+        *([rule.summary()] if rule.met else []),
         f"odometry at {rate(len(twists), seconds)}, up to {np.hypot(*twists[:, :2].T).max():.3g} m/s and "
         f"{np.abs(twists[:, 2]).max():.3g} rad/s; detections at {rate(len(log.cycles), seconds)}, "
-        f"{ranges.min():.3g} m to {ranges.max():.3g} m away: {counted}"
+        f"{ranges.min():.3g} m to {ranges.max():.3g} m away: {', '.join(counted)}",
+        *measured,
+        describe(log),
     )

@@ -35,10 +35,9 @@ from pathspace_graph.io.results import BatchRun, RunResult, write_result
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.options.map import Batch, MapKind, Online, Plot
+from pathspace_graph.options.runs import Batch, MapKind, Online, Plot
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
-from pathspace_graph.plausibility.hint import Hint, objections
-from pathspace_graph.plausibility.judge import read_plausible_log
+from pathspace_graph.plausibility.judge import Hint, objections, read_plausible_log
 from pathspace_graph.run import Observer, OnlineEstimator, run_online, with_own
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import EVENTS
@@ -54,25 +53,8 @@ Run = TypeVar("Run", bound=RunResult)
 class KnownTrack:
     """A map that is known before the drive."""
 
-    path: Path
     map: Map
     start: Array | None  # pose (3,) at the begin of an open one (m, m, rad), map frame; None of a closed one
-
-    def found_at(self, estimator: OnlineEstimator) -> float | None:
-        """Stamp (s) at which the vehicle was found on the map, if it was."""
-        return estimator.placed_at if isinstance(estimator, FixedLagMapper) else None
-
-    def differences(self, result: RunResult, estimator: OnlineEstimator) -> list[MapDifference]:
-        """Changes of the track against the known map, once the vehicle was found on it."""
-        if self.found_at(estimator) is None:
-            return []
-        found = differences(scaled(self.map, 1.0 / result.scale), result.at_scale_one().map)
-        return [scaled(one, result.scale) for one in found]
-
-    def summary(self, estimator: OnlineEstimator, differ: list[MapDifference]) -> dict[str, Any]:
-        """Entries of `summary.json` about the map."""
-        known = {"map": str(self.path), "found_at": self.found_at(estimator)}
-        return {"known_map": known, "differences": [asdict(one) for one in differ]}
 
 
 def read_known_map(path: Path, sigma: float, settings: MapperSettings) -> KnownTrack:
@@ -82,7 +64,7 @@ def read_known_map(path: Path, sigma: float, settings: MapperSettings) -> KnownT
     """
     if path.is_dir() or path.name == MAP_FILE:
         track = read_map(path)
-        return KnownTrack(path, track, None if track.closed else np.zeros(3))
+        return KnownTrack(track, None if track.closed else np.zeros(3))
     if not path.exists() and str(path) in EVENTS:
         drawn = EVENTS[str(path)]()
     elif path.exists():
@@ -91,7 +73,7 @@ def read_known_map(path: Path, sigma: float, settings: MapperSettings) -> KnownT
         events = " or ".join(EVENTS)
         raise InputError(path, f"expected a map's folder, a track file, {events}, found none")
     track = map_of_cones(*drawn.rows, drawn.closed, sigma, settings)
-    return KnownTrack(path, track, None if drawn.closed else drawn.start)
+    return KnownTrack(track, None if drawn.closed else drawn.start)
 
 
 def online_command(options: Online) -> Outcome:
@@ -117,17 +99,23 @@ def online_command(options: Online) -> Outcome:
         observers = [] if recorder is None else [recorder]
         mapped = map_online(log, estimator, options.estimator, observers)
         result = of_kind(with_own(mapped, parameters), options.map, options.settings)
-        differ = [] if known is None else known.differences(result, estimator)
-        summarized = summarize(result, log, hints)
-        summarized |= {} if known is None else known.summary(estimator, differ)
+        summarized, changes = summarize(result, log, hints), list[MapDifference]()
+        found_at = estimator.placed_at if isinstance(estimator, FixedLagMapper) else None
+        if known is not None and found_at is not None:
+            before = scaled(known.map, 1.0 / result.scale)
+            found = differences(before, result.at_scale_one().map)
+            changes = [scaled(one, result.scale) for one in found]
+        if known is not None:
+            summarized["known_map"] = {"map": str(options.on), "found_at": found_at}
+            summarized["differences"] = [asdict(one) for one in changes]
         write_result(options.out, result, summarized, force=options.force)
     if options.plot is not None:
         plotting().plot_command(Plot(map=options.out, out=options.plot, log=None if known else options.log))
     report(result, log)
-    say(*(one.line for one in differ))
+    say(*(one.line for one in changes))
     crossed = crossings_told(crossings_of(result))
     wrong = objections(hints) + ([f"not a map of the drive: {crossed}"] if crossed else [])
-    if known is not None and known.found_at(estimator) is None:
+    if known is not None and found_at is None:
         wrong.append(f"the vehicle was not found on {options.on}: this is the map of its own road")
     files = (options.out, options.plot, options.save_view)
     return Outcome([file for file in files if file is not None], summarized, wrong)
@@ -150,7 +138,7 @@ def check_online_options(options: Online) -> None:
 
 
 def own_parameters(options: Online | Batch) -> Any:
-    """Return the estimator's own parameters with those of the file; InputError where something is wrong."""
+    """Estimator's own parameters with those of the file; InputError where something is wrong."""
     try:
         parameters, rest = estimators.with_parameters(options.estimator, options.own([options.estimator]))
         override(options.settings, rest, "")
@@ -261,23 +249,22 @@ def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
     if kind == "boundaries":
         return result
 
+    failed = list[SettingsError]()
+
     def line(track: Map) -> Map:
-        found = as_ribbon(scaled(track, 1.0 / result.scale), settings.spline.sigma_shape)
+        try:
+            found = as_ribbon(scaled(track, 1.0 / result.scale), settings.spline.sigma_shape)
+        except SettingsError as error:
+            failed.append(error)
+            return track
         return scaled(found, result.scale)
 
-    def line_if_any(track: Map) -> Map:
-        try:
-            return line(track)
-        except SettingsError:
-            return track
-
-    try:
-        last = line(result.map)
-    except SettingsError as error:
-        note(f"--map {kind}: {error}, and the map is of boundaries")
+    last = line(result.map)
+    if failed:
+        note(f"--map {kind}: {failed[0]}, and the map is of boundaries")
         return result
-    laps = tuple((lap, line_if_any(track)) for lap, track in result.lap_maps)
-    return replace(result, map=last, lap_maps=laps, snapshots=tuple(map(line_if_any, result.snapshots)))
+    laps = tuple((lap, line(track)) for lap, track in result.lap_maps)
+    return replace(result, map=last, lap_maps=laps, snapshots=tuple(map(line, result.snapshots)))
 
 
 def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:

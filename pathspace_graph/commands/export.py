@@ -12,17 +12,14 @@ from pathspace_graph.io.export import LocalPlane
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE
 from pathspace_graph.io.log_files import read_log
-from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, read_map
+from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FILE, write_trajectory
 from pathspace_graph.io.tables import read_table, read_trajectory
-from pathspace_graph.options.map import Export
+from pathspace_graph.options.runs import Export
 from pathspace_graph.spline.ahead import LEAST_STEP, MOST_POINTS
 from pathspace_graph.spline.boundary import crossed_boundaries, crossings_told
 
 from .outcome import Outcome
-
-ALONG_THE_ROAD = ("centerline", "profile", "geojson", "lanelet2")  # formats that say where to drive
-ON_EARTH = ("geojson", "lanelet2")  # formats that have latitude and longitude
 
 
 def export_command(options: Export) -> Outcome:
@@ -32,7 +29,7 @@ def export_command(options: Export) -> Outcome:
         raise SettingsError(f"--step: {expected}, found {options.step:g}")
     if options.format != "profile" and (options.stop or options.start_speed is not None):
         raise SettingsError(f"--start-speed, --stop: expected --as profile, found --as {options.format}")
-    if options.format in ON_EARTH and options.origin is None:
+    if options.format in ("geojson", "lanelet2") and options.origin is None:
         expected = "expected LATITUDE LONGITUDE HEADING in degrees, the heading clockwise from north"
         raise SettingsError(f"--origin: {expected}, found none, which --as {options.format} needs")
     plane = None if options.origin is None else LocalPlane(*options.origin)
@@ -41,8 +38,12 @@ def export_command(options: Export) -> Outcome:
         write_true_path(options.map, options.out)
         return Outcome([options.out])
     track = read_map(options.map)
-    check_length(track, options.step, file)
-    if options.format in ALONG_THE_ROAD:
+    most = MOST_POINTS * options.step
+    for curve in track.splines.values():
+        if (length := curve.length()) > most:
+            expected = f"expected curves of at most {most:g} m at this step"
+            raise InputError(file, f"{expected}, found {length:.6g} m")
+    if options.format not in ("points", "tum"):  # the others say where to drive
         check_crossings(track, options.map)
     with atomic_file(options.out) as temporary:
         try:
@@ -89,13 +90,3 @@ def check_crossings(track: Map, folder: Path) -> None:
     crossed = crossings_told(crossed_boundaries(track.splines, path, known))
     if crossed:
         raise InputError(folder / MAP_FILE, f"expected the map of the drive in {file.name}: {crossed}")
-
-
-def check_length(track: Map, step: float, file: Path) -> None:
-    """Raise an InputError where a curve has too many points at this step (m)."""
-    most = MOST_POINTS * step
-    for boundary in track.boundaries.values():
-        length = boundary.spline.length() if isinstance(boundary, SplineBoundary) else 0.0
-        if length > most:
-            expected = f"expected curves of at most {most:g} m at this step"
-            raise InputError(file, f"{expected}, found {length:.6g} m")

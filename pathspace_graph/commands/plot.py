@@ -12,7 +12,7 @@ from pathspace_graph.io.map import read_map
 from pathspace_graph.io.parsing import read_json
 from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FILE
 from pathspace_graph.io.tables import read_trajectory
-from pathspace_graph.options.map import Plot
+from pathspace_graph.options.runs import Plot
 
 from .outcome import Outcome
 

@@ -17,7 +17,7 @@ from pathspace_graph.eval.experiment.study import Study, find_study, log_folders
 from pathspace_graph.eval.experiment.tables import write_study
 from pathspace_graph.eval.report import ReportPlan, write_report
 from pathspace_graph.io.files import check_target
-from pathspace_graph.options.study import Ablate, FaultSuite, Report, Scale, StudyCommand
+from pathspace_graph.options.runs import Ablate, FaultSuite, Report, Scale, StudyCommand
 from pathspace_graph.settings.evaluation import ScalingSettings
 
 from .outcome import Outcome

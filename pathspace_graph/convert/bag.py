@@ -1,33 +1,25 @@
 """ROS bags, read without ROS: rosbag1, and rosbag2 as sqlite3 and mcap."""
 
 import re
+import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
+from io import BytesIO
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, BinaryIO, Final, NamedTuple
 
+import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError, install
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.parsing import read_text
 
-from .containers import READABLE, described
-from .messages import (
-    MessageError,
-    Points,
-    frame_of,
-    namespaces_of,
-    points_of,
-    pose_of,
-    stamp_of,
-    twist_of,
-    yaw_rate_of,
-)
-from .recording import Recording, check_clock, rate
-from .settings import BagOptions, LabelRule
+from . import messages
+from .messages import MessageError, Points
+from .recording import Recording, check_clock, chosen_motion, rate
+from .settings import LabelRule, Topics
 
 SUPPORTED: Final = {  # contents that a message must have, by the option of its topic
     "--odometry": "a twist, a speed or a pose",
@@ -36,9 +28,7 @@ SUPPORTED: Final = {  # contents that a message must have, by the option of its 
     "transforms": "transforms",
 }
 STATIC: Final = "/tf_static"  # topic of the transforms between frames that are fixed to the vehicle
-BODIES: Final = ("base_link", "base_footprint")  # frames of a vehicle whose odometry names none
 LEVEL: Final = 0.98  # least cosine of a level sensor's z axis and the vehicle's
-LATE: Final = 0.1  # median delay (s) of receipt from which a note is made
 
 
 class Samples(NamedTuple):
@@ -59,21 +49,26 @@ class Motion(NamedTuple):
     body: str  # frame of the twist
 
 
-def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool = False) -> Recording:
+def read_bag(path: Path, options: Topics, rule: LabelRule, *, mounted: bool = False) -> Recording:
     """Read the drive in the topics of a bag; `mounted` says that the sensor's pose was stated."""
     notes, namespaces = Counter[str](), Counter[str]()
 
     def motion(message: Any) -> Motion:
-        twist = twist_of(message, options.wheelbase)
-        return Motion(twist, pose_of(message), frame_of(message), frame_of(message, "child_frame_id"))
+        twist = messages.twist_of(message, options.wheelbase)
+        return Motion(
+            twist,
+            messages.pose_of(message),
+            messages.frame_id_of(message),
+            messages.frame_id_of(message, "child_frame_id"),
+        )
 
     def points(message: Any) -> tuple[str, Points]:
-        namespaces.update(namespaces_of(message))
-        return frame_of(message), points_of(message, rule, options.namespaces)
+        namespaces.update(marker.ns for marker in messages.added(getattr(message, "markers", ())))
+        return messages.frame_id_of(message), messages.points_of(message, rule, options.namespaces)
 
     with closing(Bag(path, options, notes)) as bag:
         odometry = bag.samples(options.odometry, "--odometry", motion)
-        imu = bag.samples(options.imu, "--imu", yaw_rate_of) if options.imu else None
+        imu = bag.samples(options.imu, "--imu", messages.yaw_rate_of) if options.imu else None
         detections = bag.samples(options.detections, "--detections", points)
         static = [] if mounted else bag.transforms()
     listed = ", ".join(f"'{name}' ({count} markers)" for name, count in sorted(namespaces.items()))
@@ -86,7 +81,18 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
         notes[told] += len(namespaces)
     if imu is not None:
         check_clock(imu.t, "the IMU", path)
-    moved, are_poses = _motion(odometry, imu is not None, options, path)
+    twists = np.array([one.twist for one in odometry.values if one.twist is not None])
+    poses = np.array([one.pose for one in odometry.values if one.pose is not None])
+    moved, are_poses = chosen_motion(
+        twists if len(twists) else None,
+        poses if len(poses) == len(odometry.values) else None,
+        odometry.name,
+        path,
+        from_poses=options.from_poses,
+    )
+    if imu is None and not are_poses and np.isnan(moved[:, 2]).all():
+        expected = "expected --imu TOPIC for the yaw rate, or --wheelbase where there is a steering angle"
+        raise InputError(path, f"{odometry.name}: {expected}, found neither")
     mounting = None if mounted else _mounting(odometry, detections, static, notes, path)
     source = {"bag": path.name, "odometry": odometry.name, "detections": detections.name}
     source |= {} if imu is None else {"imu": imu.name}
@@ -106,25 +112,6 @@ def read_bag(path: Path, options: BagOptions, rule: LabelRule, *, mounted: bool 
     )
 
 
-def _motion(odometry: Samples, has_imu: bool, options: BagOptions, path: Path) -> tuple[Array, bool]:
-    """Twists (N, 3) of the vehicle, with NaN for what an IMU gives, or its poses; and which of both."""
-    measured = [motion.twist for motion in odometry.values if motion.twist is not None]
-    poses = np.array([motion.pose for motion in odometry.values if motion.pose is not None])
-    whole = len(poses) == len(odometry.values)
-    if options.from_poses or not measured:
-        if not whole:
-            raise InputError(path, f"--from-poses: expected messages with a pose, found {odometry.name}")
-        return poses, True
-    twists = np.array(measured)
-    if whole and not twists.any() and np.ptp(poses, axis=0).any():
-        found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
-        raise InputError(path, f"{odometry.name}: expected twists, {found}")
-    if not has_imu and np.isnan(twists[:, 2]).all():
-        expected = "expected --imu TOPIC for the yaw rate, or --wheelbase where there is a steering angle"
-        raise InputError(path, f"{odometry.name}: {expected}, found neither")
-    return twists, False
-
-
 # --- where the sensor is ---------------------------------------------------------------------------------
 
 
@@ -139,37 +126,36 @@ def _mounting(
         otherwise = "--mounting 0 0 0 takes them as in the vehicle frame"
         raise InputError(path, f"{detections.name}: {expected}, {found}; {otherwise}")
     named = {one.header.frame_id.lstrip("/") for one in static}
-    body = first.body or next((name for name in BODIES if name in named), "")
+    body = first.body or next((name for name in ("base_link", "base_footprint") if name in named), "")
     others = sorted(frames - {body})
     if not body or not others:
         return None
     place = transform_between(static, body, others[0]) if len(others) == 1 else None
-    if place is not None and place[2, 2] > LEVEL:
-        (x, y), yaw = place[:2, 3], np.arctan2(place[1, 0], place[0, 0])
+    if place is not None and place.rotation().matrix()[2, 2] > LEVEL:
+        x, y, yaw = place.x(), place.y(), place.rotation().yaw()
         told = f"which {STATIC} puts at {x:.3g} {y:.3g} {yaw:.3g} (m, m, rad) in {body}"
         notes[f"messages with detections are in frame {others[0]}, {told}"] += len(detections.values)
-        return float(x), float(y), float(yaw)
+        return x, y, yaw
     told = f"in frame {', '.join(others)}, the odometry is of {body}: --mounting states where the sensor is"
     notes[f"messages with detections are {told}"] += len(detections.values)
     return None
 
 
-def transform_between(static: list[Any], body: str, sensor: str) -> Array | None:
-    """`body_T_sensor` (4, 4) by `TransformStamped`s between frames, None if nothing connects them."""
-    edges: dict[str, list[tuple[str, Array]]] = {}
+def transform_between(static: list[Any], body: str, sensor: str) -> gtsam.Pose3 | None:
+    """`body_T_sensor` by `TransformStamped`s between frames, None if nothing connects them."""
+    edges: dict[str, list[tuple[str, gtsam.Pose3]]] = {}
     for one in static:
         parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
         q, p = one.transform.rotation, one.transform.translation
-        step = np.eye(4)
-        step[:3, :3], step[:3, 3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), (p.x, p.y, p.z)
+        step = gtsam.Pose3(gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), [p.x, p.y, p.z])
         edges.setdefault(parent, []).append((child, step))
-        edges.setdefault(child, []).append((parent, np.asarray(np.linalg.inv(step), float)))
-    known, waiting = {body: np.eye(4)}, [body]
+        edges.setdefault(child, []).append((parent, step.inverse()))
+    known, waiting = {body: gtsam.Pose3()}, [body]
     while waiting:
         frame = waiting.pop()
         for other, step in edges.get(frame, []):
             if other not in known:
-                known[other] = known[frame] @ step
+                known[other] = known[frame].compose(step)
                 waiting.append(other)
     return known.get(sensor)
 
@@ -180,7 +166,7 @@ def transform_between(static: list[Any], body: str, sensor: str) -> Array | None
 class Bag:
     """A bag as the package `rosbags` reads it, with InputErrors in place of its errors."""
 
-    def __init__(self, path: Path, options: BagOptions, notes: Counter[str]) -> None:
+    def __init__(self, path: Path, options: Topics, notes: Counter[str]) -> None:
         if not path.exists():
             raise InputError(path, "expected a bag, found none")
         try:
@@ -219,10 +205,6 @@ class Bag:
             return Samples(name, np.array(received), values, np.arange(len(values)) + 1)
         self._notes[f"messages of {topic} without a stamp were left out"] += len(stamps) - len(stamped)
         t = np.array([stamps[k] for k in stamped], dtype=float)
-        late = float(np.median(np.array(received)[stamped] - t))
-        if abs(late) > LATE:
-            told = f"messages of {topic} were received {late:.3g} s after their stamps, in the median"
-            self._notes[f"{told} (--received takes the times of receipt)"] += len(stamped)
         return Samples(name, t, [values[k] for k in stamped], np.array(stamped) + 1)
 
     def transforms(self) -> list[Any]:
@@ -250,10 +232,10 @@ class Bag:
             return received, stamps, values
         store, kind = self._store(connections[0]), connections[0].msgtype
         decode = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
-        messages = self._reader.messages(connections)
+        found = self._reader.messages(connections)
         while True:
             try:
-                _, time, data = next(messages)
+                _, time, data = next(found)
             except StopIteration:
                 return received, stamps, values
             except Exception as error:
@@ -262,7 +244,7 @@ class Bag:
             try:
                 message = decode(data, kind)
                 values.append(take(message))
-                stamps.append(stamp_of(message))
+                stamps.append(messages.stamp_of(message))
             except MessageError as error:
                 told = f"{option} {connections[0].topic} ({kind}): {error}"
                 raise self._error(f"{told}; supported are messages with {SUPPORTED[option]}") from None
@@ -310,3 +292,76 @@ class Bag:
             except Exception as error:
                 raise InputError(file, f"expected the definition of {name} ({error})") from None
         return types
+
+
+# --- what is no bag ----------------------------------------------------------------------------------------
+
+MCAP: Final = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL = 1, 2, 3, 4  # kinds of records of an MCAP file
+FOOTER_BYTES: Final = 37  # of the last record of an MCAP file with what is around it
+MOST_NAMED: Final = 8  # number of topics that are named
+KINDS: Final = {  # kind of a file, by its first bytes
+    b"#ROSBAG": "a bag of ROS 1 that is damaged or was cut off",
+    b"SQLite format 3": "an SQLite database that is no bag, is damaged or was cut off",
+    b"PK\x03\x04": "a ZIP archive",
+    b"\x1f\x8b": "a file that gzip has compressed as a whole",
+    b"\x28\xb5\x2f\xfd": "a file that zstd has compressed as a whole",
+    b"ULog": "a ULog of PX4",
+    b"": "a file of another kind",
+}
+READABLE: Final = (
+    "read are bags of ROS 1 and ROS 2 (.bag, .db3, and .mcap of profile 'ros2'), CSV (--from csv) and "
+    "JSON lines (--from jsonl)"
+)
+
+
+def described(path: Path) -> str:
+    """Say what a file, or each file of a folder, holds that is no bag."""
+    if path.is_dir():
+        files = sorted(file for file in path.iterdir() if file.is_file() and file.name != "metadata.yaml")
+        return (
+            "; ".join(f"{file.name}, {described(file)}" for file in files[:MOST_NAMED]) or "an empty folder"
+        )
+    with path.open("rb") as stream:
+        begin = stream.read(len(MCAP))
+        if begin == MCAP:
+            return described_mcap(stream)
+        begin += stream.read(len(MCAP))
+    return next(kind for magic, kind in KINDS.items() if begin.startswith(magic))
+
+
+def described_mcap(stream: BinaryIO) -> str:
+    """Say which messages an MCAP file holds, by the records of its summary."""
+    stream.seek(max(stream.seek(0, 2) - FOOTER_BYTES, 0))
+    end = stream.read()
+    if len(end) < FOOTER_BYTES or not end.endswith(MCAP) or end[0] != FOOTER:
+        return "an MCAP file that was cut off or is damaged"
+    (summary,) = struct.unpack("<Q", end[9:17])
+    profile, schemas, topics, kind = "", dict[int, str](), dict[str, tuple[str, str]](), HEADER
+    stream.seek(len(MCAP))
+    with suppress(struct.error, UnicodeDecodeError):
+        while kind != FOOTER:
+            kind, size = struct.unpack("<BQ", stream.read(9))
+            record = BytesIO(stream.read(size))
+            if kind == HEADER:
+                profile = _text(record)
+                stream.seek(summary or stream.tell())
+            elif kind == SCHEMA:
+                (key,) = struct.unpack("<H", record.read(2))
+                schemas[key] = _text(record)
+            elif kind == CHANNEL:
+                _, key = struct.unpack("<HH", record.read(4))
+                topic, encoding = _text(record), _text(record)
+                topics[topic] = schemas.get(key, "no schema"), encoding
+    named = [f"{topic} ({schema})" for topic, (schema, _) in sorted(topics.items())]
+    listed = ", ".join(named[:MOST_NAMED]) + ", ..." * (len(named) > MOST_NAMED)
+    encodings = " and ".join(sorted({encoding for _, encoding in topics.values()}))
+    if profile == "ros2" and encodings == "cdr":
+        return "an MCAP file of ROS 2 that is damaged"
+    return f"an MCAP file of {encodings or 'no'} messages (profile '{profile}'), not of ROS 2: {listed}"
+
+
+def _text(record: BytesIO) -> str:
+    """Text of a record, after its length."""
+    (size,) = struct.unpack("<I", record.read(4))
+    return record.read(size).decode()

@@ -2,34 +2,21 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
-from .messages import ALONE, Points
+from .messages import Points
 from .settings import LEAST_SPACING, Frames
-
-SPACING_SHARE: Final = 0.15  # spacing by the median range, which has the size of the scene
-WALL_SAMPLES: Final = 1_000_000  # of the driven path
-WALL_STRETCH: Final = 2.0  # reach along the path, ahead and behind, in ranges of the point
-WALL_FARTHEST: Final = 3.0  # distance of a boundary point from the path, in distances of the median point
-NEXT_LINE: Final = 1.5  # distance of a polyline from the path, in distances of the nearest one on its side
-
-
-def are_lines(points: Points, spacing: float | None) -> bool:
-    """Whether a record has points of lines: a spacing is stated, or no point stands alone."""
-    return spacing is not None or bool(len(points.lines) and (points.lines != ALONE).all())
 
 
 def default_spacing(points: Points) -> float:
-    """Spacing (m) of a record that states none."""
-    return max(SPACING_SHARE * float(np.median(np.hypot(*points.points.T))), LEAST_SPACING)
+    """Spacing (m) of a record that states none, by the median range, which has the size of the scene."""
+    return max(0.15 * float(np.median(np.hypot(*points.points.T))), LEAST_SPACING)
 
 
 def lines_of(
@@ -51,14 +38,14 @@ def lines_of(
         f"points of lines are {spacing:.2g} m apart (--spacing), of {len(points.labels)} that were recorded"
     )
     notes[told] += len(found.labels)
-    path = DrivenPath.of(odometry, 0.5 * spacing)
-    places = [in_vehicle(scan.points, frames) for scan in scans]
+    path = ReckonedPath.of(odometry, 0.5 * spacing)
+    places = [from_sensor(scan.points, frames) for scan in scans]
     lateral = [path.lateral(float(at), own) for at, own in zip(t, places, strict=True)]
     kept = np.concatenate([nearest_lines(scan.lines, own) for scan, own in zip(scans, lateral, strict=True)])
     away = np.concatenate(lateral)
     known = np.abs(away[np.isfinite(away)])
     if len(known):
-        kept &= ~(np.abs(away) > WALL_FARTHEST * np.median(known))
+        kept &= ~(np.abs(away) > 3.0 * np.median(known))
     labels = np.select(
         [found.labels != UNKNOWN, away > 0.0, away < 0.0], [found.labels, LEFT, RIGHT], UNKNOWN
     )
@@ -66,7 +53,7 @@ def lines_of(
     return found._replace(labels=labels).where(kept)
 
 
-def in_vehicle(points: Array, frames: Frames) -> Array:
+def from_sensor(points: Array, frames: Frames) -> Array:
     """Transform points (m, 2) of the sensor to the vehicle frame."""
     x, y, yaw = frames.mounting or (0.0, 0.0, 0.0)
     return np.asarray((points * frames.sides) @ rotation(yaw).T + np.array([x, y]))
@@ -79,14 +66,14 @@ def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
     middles = np.array([np.nanmedian(lateral[lines == line]) for line in numbers])
     for side in (1.0, -1.0):
         away = np.where(side * middles > 0.0, side * middles, np.inf)
-        far = numbers[(away > NEXT_LINE * away.min(initial=np.inf)) & np.isfinite(away)]
+        far = numbers[(away > 1.5 * away.min(initial=np.inf)) & np.isfinite(away)]
         kept &= ~np.isin(lines, far)
     return kept
 
 
 def along_lines(points: Points, spacing: float) -> Points:
     """Interpolate polylines and thin dense points to a spacing (m)."""
-    parts = [points.where(thinned(points.points, spacing, points.lines < 0))]
+    parts = [points.where(spaced_apart(points.points, spacing, points.lines < 0))]
     for line in np.unique(points.lines[points.lines >= 0]):
         own = points.where(points.lines == line)
         placed = resampled(own.points, spacing)
@@ -102,7 +89,7 @@ def resampled(vertices: Array, spacing: float) -> Array:
     return np.column_stack([np.interp(at, s, vertices[:, 0]), np.interp(at, s, vertices[:, 1])])
 
 
-def thinned(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
+def spaced_apart(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
     """Indices of chosen points (m, 2) no two of which are nearer than the spacing (m).
 
     They are chosen by bearing, since by range the noise of the ranges would choose.
@@ -117,7 +104,7 @@ def thinned(points: Array, spacing: float, chosen: BoolArray) -> IntArray:
 
 
 @dataclass(frozen=True, eq=False)
-class DrivenPath:
+class ReckonedPath:
     """The path driven, by dead reckoning from the pose at the first twist."""
 
     t: Array  # (N,) stamps (s)
@@ -127,11 +114,10 @@ class DrivenPath:
     at: Array  # (k,) their path lengths (m)
 
     @classmethod
-    def of(cls, odometry: Odometry, step: float) -> "DrivenPath":
-        moves = integrate_poses(np.diff(odometry.t), odometry.twist[:-1])
-        poses = np.vstack([np.zeros(3), moves])
+    def of(cls, odometry: Odometry, step: float) -> "ReckonedPath":
+        poses = odometry.poses()
         s = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
-        at = np.linspace(0.0, s[-1], int(min(np.ceil(s[-1] / step), WALL_SAMPLES)) + 1)
+        at = np.linspace(0.0, s[-1], int(min(np.ceil(s[-1] / step), 1_000_000)) + 1)
         moved = np.diff(s, prepend=-1.0) > 0.0
         points = np.column_stack([np.interp(at, s[moved], poses[moved, k]) for k in range(2)])
         return cls(odometry.t, poses, s, points, at)
@@ -144,7 +130,7 @@ class DrivenPath:
         """
         x, y, heading, here = (np.interp(t, self.t, of) for of in (*self.poses.T, self.s))
         placed = points @ rotation(float(heading)).T + np.array([x, y])
-        reach = WALL_STRETCH * np.hypot(*points.T)
+        reach = 2.0 * np.hypot(*points.T)  # along the path, ahead and behind
         near = np.abs(self.at - here) <= reach.max(initial=0.0)
         path, at = self.points[near], self.at[near]
         if len(path) < 2:

@@ -7,11 +7,10 @@ from numbers import Real
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import PathspaceError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.io.covariances import covariances_of
+from pathspace_graph.io.log import covariances_of
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
 from .settings import LABEL_FIELDS, NO_LABEL, LabelRule
@@ -22,14 +21,10 @@ LIST_NAMES: Final = {  # labels of the cones in a list with such a word in its n
 }
 CLOUD_TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # by `datatype`
 POINT_MARKERS: Final = (1, 2, 3, 10)  # types of markers that are one point: cube, sphere, cylinder, mesh
-LIST_MARKERS: Final = (6, 7, 8)  # types of markers that are lists of points: cubes, spheres, points
 LINE_STRIP: Final = 4  # type of a marker that is a polyline
 ALONE: Final = -1  # in place of the number of a polyline: a point that stands alone, as a cone does
 DENSE: Final = -2  # a point of a scan, anywhere along a line or a wall
-ADDED: Final = 0  # action of a marker that is added; others are taken away
 POSITIONS: Final = ("point", "position", "location", "center", "pose", "bbox")  # of a cone without x and y
-SPEEDS: Final = ("speed", "data", "vx")  # fields of a speed alone
-YAW_RATES: Final = ("wz", "yaw_rate")  # fields of a yaw rate beside it
 
 
 class MessageError(PathspaceError):
@@ -89,7 +84,7 @@ class Points(NamedTuple):
 def header_of(message: Any) -> Any:
     """Header of a message, of the first point of an array of markers, or None."""
     if hasattr(message, "markers"):
-        return next((marker.header for marker in _added(message.markers)), None)
+        return next((marker.header for marker in added(message.markers)), None)
     return getattr(message, "header", None)
 
 
@@ -101,7 +96,7 @@ def stamp_of(message: Any) -> float | None:
     return float(header.stamp.sec + 1e-9 * header.stamp.nanosec)
 
 
-def frame_of(message: Any, name: str = "frame_id") -> str:
+def frame_id_of(message: Any, name: str = "frame_id") -> str:
     """Frame of a message by its header, or by this field of its own; empty where it has none."""
     frame = getattr(message, name, None) or getattr(header_of(message), name, "")
     return str(frame).lstrip("/")
@@ -119,7 +114,7 @@ def twist_of(message: Any, wheelbase: float | None = None) -> Array | None:
     if hasattr(twist, "linear") and hasattr(twist, "angular"):
         return np.array([twist.linear.x, twist.linear.y, twist.angular.z], dtype=float)
     drive = getattr(message, "drive", message)
-    speed, rate = (first_of(drive, names) for names in (SPEEDS, YAW_RATES))
+    speed, rate = (first_of(drive, names) for names in (("speed", "data", "vx"), ("wz", "yaw_rate")))
     if isinstance(speed, Real):
         if hasattr(drive, "steering_angle") and wheelbase is not None:
             rate = speed * np.tan(drive.steering_angle) / wheelbase
@@ -182,42 +177,28 @@ def scan_points(scan: Any) -> Points:
 
 def cloud_points(cloud: Any, rule: LabelRule) -> Points:
     """Points of a `PointCloud2` by its fields `x`, `y`, the label and, if any, xx, xy, yy."""
-    columns, covariances = _cloud_columns(cloud), None
-    points = np.column_stack([columns["x"], columns["y"]])
-    if {"xx", "xy", "yy"} <= columns.keys():
-        covariances = covariances_of(*(columns[entry].astype(float) for entry in ("xx", "xy", "yy")))
-    labels = np.full(len(points), UNKNOWN)
-    if rule.fields != (NO_LABEL,):
-        name = next((name for name in rule.fields if name in columns), None)
-        if name is None:
-            wanted = f"one of {', '.join(rule.fields)}" if len(rule.fields) > 1 else f"'{rule.fields[0]}'"
-            found = f"found {', '.join(columns)} (--label-field names it, `{NO_LABEL}` does without)"
-            raise MessageError(f"expected a point cloud with labels in the field {wanted}, {found}")
-        labels = rule.of_all(columns[name])
-    return Points.of(points, labels, covariances)
-
-
-def _cloud_columns(cloud: Any) -> dict[str, NDArray[Any]]:
-    order = ">" if cloud.is_bigendian else "<"
     known = {field.name: field for field in cloud.fields if field.datatype in CLOUD_TYPES}
     if not {"x", "y"} <= known.keys():
         raise MessageError(f"expected a point cloud with the fields x and y, found {', '.join(known)}")
-    if not cloud.width * cloud.height:
-        return {name: np.zeros(0) for name in known}
+    order = ">" if cloud.is_bigendian else "<"
     formats = [order + CLOUD_TYPES[field.datatype] for field in known.values()]
-    layout = {"names": [*known], "formats": formats, "itemsize": cloud.point_step}
-    layout["offsets"] = [field.offset for field in known.values()]
-    try:
-        of_a_point = np.dtype(layout)  # type: ignore[call-overload]
-    except ValueError as error:
-        expected = f"expected fields inside the {cloud.point_step} bytes of a point"
-        raise MessageError(f"{expected}: {error}") from None
-    rows, needed = np.frombuffer(bytes(cloud.data), np.uint8), cloud.height * cloud.row_step
-    if cloud.row_step < cloud.width * cloud.point_step or len(rows) < needed:
-        raise MessageError(f"expected a point cloud of {needed} bytes, found {len(rows)}")
-    rows = rows[:needed].reshape(cloud.height, cloud.row_step)[:, : cloud.width * cloud.point_step]
-    points = np.ascontiguousarray(rows).reshape(-1).view(of_a_point)
-    return {name: points[name] for name in known}
+    offsets = [field.offset for field in known.values()]
+    layout = {"names": [*known], "formats": formats, "offsets": offsets, "itemsize": cloud.point_step}
+    of_a_point = np.dtype(layout)  # type: ignore[call-overload]
+    rows = np.frombuffer(bytes(cloud.data), np.uint8)[: cloud.height * cloud.row_step]
+    rows = rows.reshape(cloud.height, cloud.row_step)[:, : cloud.width * cloud.point_step]
+    columns = np.ascontiguousarray(rows).reshape(-1).view(of_a_point)
+    labels, covariances = np.full(len(columns), UNKNOWN), None
+    if {"xx", "xy", "yy"} <= known.keys():
+        covariances = covariances_of(*(columns[entry].astype(float) for entry in ("xx", "xy", "yy")))
+    if rule.fields != (NO_LABEL,):
+        name = next((name for name in rule.fields if name in known), None)
+        if name is None:
+            wanted = f"one of {', '.join(rule.fields)}" if len(rule.fields) > 1 else f"'{rule.fields[0]}'"
+            found = f"found {', '.join(known)} (--label-field names it, `{NO_LABEL}` does without)"
+            raise MessageError(f"expected a point cloud with labels in the field {wanted}, {found}")
+        labels = rule.of_all(columns[name])
+    return Points.of(np.column_stack([columns["x"], columns["y"]]), labels, covariances)
 
 
 def array_points(message: Any, rule: LabelRule) -> Points:
@@ -237,7 +218,7 @@ def marker_points(array: Any, rule: LabelRule, namespaces: Sequence[str] = ()) -
     A strip of lines is a polyline. Markers are those of the namespaces, by default of all.
     """
     points, labels, lines = list[tuple[float, float]](), list[int](), list[int]()
-    for number, marker in enumerate(_added(array.markers)):
+    for number, marker in enumerate(added(array.markers)):
         if namespaces and marker.ns not in namespaces:
             continue
         at, colours = marker.pose.position, [marker.color]
@@ -254,14 +235,10 @@ def marker_points(array: Any, rule: LabelRule, namespaces: Sequence[str] = ()) -
     return Points.of(points, labels, lines=lines)
 
 
-def _added(markers: Iterable[Any]) -> Iterator[Any]:
-    known = (*POINT_MARKERS, *LIST_MARKERS, LINE_STRIP)
-    return (marker for marker in markers if marker.action == ADDED and marker.type in known)
-
-
-def namespaces_of(message: Any) -> list[str]:
-    """Namespace of each marker of a message that is added; none of other messages."""
-    return [marker.ns for marker in _added(getattr(message, "markers", ()))]
+def added(markers: Iterable[Any]) -> Iterator[Any]:
+    """Yield the markers that are points or polylines and are not taken away."""
+    known = (*POINT_MARKERS, LINE_STRIP, 6, 7, 8)  # the last are lists of cubes, spheres and points
+    return (marker for marker in markers if marker.action == 0 and marker.type in known)
 
 
 def cone_points(message: Any, rule: LabelRule) -> Points:
@@ -277,8 +254,7 @@ def cone_points(message: Any, rule: LabelRule) -> Points:
     points, covariances = list[tuple[float, float]](), list[Array]()
     labels, numbers = list[int](), list[int]()
     for number, (name, one) in enumerate((name, one) for name, listed in lists.items() for one in listed):
-        vertices = _vertices(one)
-        found = [_position(one)] if vertices is None else vertices
+        found, is_polyline = _positions(one)
         label = next((label for word, label in LIST_NAMES.items() if word in name.lower()), None)
         if label is None:
             value = _label_value(one, rule.fields)
@@ -286,7 +262,7 @@ def cone_points(message: Any, rule: LabelRule) -> Points:
         points += found
         labels += [label] * len(found)
         covariances += [_covariance(one)] * len(found)
-        numbers += [ALONE if vertices is None else number] * len(found)
+        numbers += [number if is_polyline else ALONE] * len(found)
     return Points.of(points, labels, covariances, numbers)
 
 
@@ -308,23 +284,21 @@ def _path(cone: Any) -> Iterator[Any]:
         at = first_of(at, POSITIONS)
 
 
-def _vertices(line: Any) -> list[tuple[float, float]] | None:
-    """Vertices (m) of a polyline: arrays x and y, or a list of points. None of a single point."""
-    if np.ndim(getattr(line, "x", 0.0)) and np.ndim(getattr(line, "y", 0.0)):
-        return [(float(x), float(y)) for x, y in zip(line.x, line.y, strict=True)]
-    if any(map(_place, _path(line))):
-        return None
-    lists = [points for name, points in _lists(line).items() if name != "covariance"]
-    return [*map(_position, lists[0])] if lists else None
+def _positions(one: Any) -> tuple[list[tuple[float, float]], bool]:
+    """Position (m) of a cone, or those of the vertices of a polyline, and whether it is one.
 
-
-def _position(cone: Any) -> tuple[float, float]:
-    """Position of a cone (m), which may lie some fields deep, as in a pose with covariance."""
-    place = next(filter(None, map(_place, _path(cone))), None)
-    if place is None:
+    A position may lie some fields deep, as in a pose with covariance. A polyline has arrays x and y in its
+    place, or a list of points.
+    """
+    if np.ndim(getattr(one, "x", 0.0)) and np.ndim(getattr(one, "y", 0.0)):
+        return [(float(x), float(y)) for x, y in zip(one.x, one.y, strict=True)], True
+    if place := next(filter(None, map(_place, _path(one))), None):
+        return [place], False
+    lists = [vertices for name, vertices in _lists(one).items() if name != "covariance"]
+    if not lists:
         expected = f"x and y, range and bearing, or one of {', '.join(POSITIONS)}"
-        raise MessageError(f"expected a cone with the fields {expected}, found {_names(cone)}")
-    return place
+        raise MessageError(f"expected a cone with the fields {expected}, found {_names(one)}")
+    return [place for vertex in lists[0] for place in _positions(vertex)[0]], True
 
 
 def _place(at: Any) -> tuple[float, float] | None:

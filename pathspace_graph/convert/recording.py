@@ -2,34 +2,31 @@
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
+import gtsam
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import rotation
+from pathspace_graph.factors.se2 import relative, rotation
 from pathspace_graph.io import log as logs
-from pathspace_graph.io.covariances import is_positive_definite, ray_covariances
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_STAMP
 from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.settings.online import LimitSettings
 
-from . import twists
-from .lines import are_lines, in_vehicle, lines_of
+from .lines import from_sensor, lines_of
 from .messages import ALONE, Points
 from .settings import Frames, NoiseSettings, Window
 
-MAX_ASYMMETRY: Final = 1e-3  # largest |xy - yx| by the larger variance: messages in single precision
 MAX_DISORDER: Final = 2.0  # largest fall of stamps (s) from one message to the next of one clock
-SHORTEST: Final = 1e-6  # least time (s) that gives a rate; a bag of one message has 1 ns
 MOST_PLACES: Final = 5  # number of rows that are named
-REPEATED: Final = 0.02  # distance (m) below which two detections of a message are one
-PAIRED: Final = 0.25  # distance of two detections of one cone, by that of the next one beside them
 APART: Final = 1e6  # distance (m) of two messages where places are compared; no detection is as far
-MOST_PAIRED: Final = 0.5  # share of detections in such pairs from which each cone was reported twice
 # notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
@@ -52,12 +49,12 @@ class Recording:
     imu: tuple[Array, Array] | None = None  # stamps (s) and yaw rates (rad/s) (k,) of an IMU
     rows: IntArray | None = None  # (N,) number of each row of the odometry in its file, by default from 1
     place: str = "odometry, row"  # what is counted by it
-    units: str = ""  # option that states the units of the odometry, where there is one
+    units: str = ""  # option that states other units, where there is one
 
     @property
     def parts(self) -> int:
         """Number of parts of the interval of two twists that are interpolated; 1 for none."""
-        return 1 if self.are_poses or self.is_held else twists.parts_of(self.t)
+        return 1 if self.are_poses or self.is_held else parts_of(self.t)
 
     @property
     def numbers(self) -> IntArray:
@@ -77,9 +74,23 @@ class Recording:
         return f"{self.place} {told}{', ...' * (len(rows) > MOST_PLACES)}"
 
 
+def chosen_motion(
+    twists: Array | None, poses: Array | None, name: str, file: Path, *, from_poses: bool
+) -> tuple[Array, bool]:
+    """Twists (N, 3), or poses (N, 3) where there are none or `from_poses` is stated; and which of both."""
+    if from_poses or twists is None:
+        if poses is None:
+            raise InputError(file, f"--from-poses: expected poses, found {name}")
+        return poses, True
+    if poses is not None and not np.nan_to_num(twists).any() and np.ptp(poses, axis=0).any():
+        found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
+        raise InputError(file, f"{name}: expected twists, {found}")
+    return twists, False
+
+
 def rate(count: int, seconds: float) -> str:
     """Rate of something in words, unknown where no time (s) passed."""
-    return f"{count / seconds:.3g} Hz" if count > 1 and seconds > SHORTEST else "an unknown rate"
+    return f"{count / seconds:.3g} Hz" if count > 1 and seconds > 1e-6 else "an unknown rate"
 
 
 def check_clock(t: Array, what: str, file: Path) -> None:
@@ -107,7 +118,7 @@ def strays(t: Array) -> BoolArray:
         return np.zeros(len(t), bool)
     before, after = np.append(t[1], t[:-1]), np.append(t[1:], t[-2])
     before[0], after[-1] = t[2], t[-3]
-    far = twists.LIMITS.silence
+    far = LIMITS.silence
     apart = np.minimum(np.abs(t - before), np.abs(t - after))
     return np.asarray((apart > far) & (np.abs(before - after) <= far))
 
@@ -145,13 +156,13 @@ def to_log(
 ) -> Log:
     """Convert a record to a log; InputError of `file` if nothing is usable.
 
-    Points of lines are a spacing (m) apart, by default a share of their median range. Polylines beside points
-    that stand alone are dropped, and so is what was reported twice.
+    Points are of lines where a spacing (m) is stated, or none stands alone; they are so far apart, by default
+    a share of their median range. Else polylines are dropped, and so is what was reported twice.
     """
     frames, notes = replace(frames, mounting=frames.mounting or record.mounting), record.notes
     odometry = _odometry(record, frames, file)
     points, t = record.points, record.scan_t
-    is_line = are_lines(points, spacing)
+    is_line = spacing is not None or bool(len(points.lines) and (points.lines != ALONE).all())
     if is_line:
         points = lines_of(t, usable(points, notes), odometry, frames, spacing, notes)
     else:
@@ -168,11 +179,22 @@ def to_log(
         source=record.source,
         odometry_stated=noise.sigma_odometry is not None,
         odometry_drift=None if noise.sigma_drift is None else np.array(noise.sigma_drift),
-        detections_stated=noise.states_detections or not notes[ASSUMED],
+        detections_stated=any(own is not None for own in noise.of_detections) or not notes[ASSUMED],
     )
 
 
 # --- odometry ----------------------------------------------------------------------------------------------
+
+LIMITS: Final = LimitSettings()  # beyond which no estimator uses a twist
+ACCELERATIONS: Final = np.array([20.0, 20.0, 15.0])  # that no vehicle exceeds (m/s^2, m/s^2, rad/s^2)
+AROUND: Final = 5  # number of rows before a row, and after it, whose medians it is compared with
+MAD: Final = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
+WRAP_SHARE: Final = 0.7  # share of half a turn in a row that marks a yaw that was differenced where it wraps
+MOST_WRONG: Final = 0.05  # largest share of rows that are mistakes of single rows
+FEW: Final = 6  # number of rows that jump that are mistakes in any record
+FROZEN: Final = 1.2  # longest time (s) for which a repeated pose is one that was not measured anew
+PERIOD: Final = 0.05  # longest part (s) of an interval that is interpolated
+GAP: Final = 2.5  # a longer interval, in median ones, is a gap, over which nothing is interpolated
 
 
 def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
@@ -189,41 +211,35 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     rows = keep(
         np.asarray(np.isfinite(rows).all(axis=1)), "odometry samples that are not finite were left out"
     )
-    _check_stamps(rows[:, 1], "odometry", file, notes)
+    wrong = record.at(rows[np.abs(rows[:, 1]) > MAX_STAMP, 0].astype(int))
+    _check_stamps(rows[:, 1], "odometry", file, notes, f" in {wrong}")
     notes["odometry samples were out of order, and were sorted"] += int((np.diff(rows[:, 1]) < 0).sum())
     rows = rows[np.argsort(rows[:, 1], kind="stable")]
     last = np.diff(rows[:, 1], append=np.inf) > 0  # of samples with one stamp the last one counts
     lost = ~last[:-1] & (rows[1:, 2:] != rows[:-1, 2:]).any(axis=1)
     if 2 * lost.sum() > len(rows):
         found = f"found the stamp of another one in {lost.sum()} of {len(rows)}"
-        whole = ": are these whole seconds (--columns t=SECONDS+NANOSECONDS)?"
-        told = found + whole * bool((rows[:, 1] == np.floor(rows[:, 1])).all())
-        raise InputError(file, f"expected odometry samples with stamps of their own, {told}")
+        raise InputError(file, f"expected odometry samples with stamps of their own, {found}")
     rows = keep(last, "odometry samples had the stamp of another one, and were left out")
     if record.are_poses:
         if len(rows) < 2:
             raise InputError(file, f"expected two poses at least, found {len(rows)}")
-        often = float(np.quantile(np.abs(np.diff(rows[:, 4])) / np.diff(rows[:, 1]), 0.9))
-        if often > twists.LIMITS.yaw_rate:
-            found = f"found poses that turn by more than {often:.3g} rad/s in a tenth of the intervals"
-            unit = " (--units angle=deg)" * bool(record.units)
-            raise InputError(file, f"expected the yaw of poses in rad, {found}: is it in degrees{unit}?")
         rows = keep(
-            twists.measured_anew(rows[:, 1], rows[:, 2:]),
+            measured_anew(rows[:, 1], rows[:, 2:]),
             "odometry samples repeat the pose before them, and were left out",
         )
         notes["odometry samples are differences of poses, whose noise is not white"] += len(rows) - 1
-        moved = twists.twists_between(rows[:, 1], rows[:, 2:])
+        moved = twists_between(rows[:, 1], rows[:, 2:])
         rows = np.column_stack([rows[:-1, :2], moved])
     rows = rows[_possible(record, rows, file)]
-    odometry = twists.interpolated(rows[:, 1], rows[:, 2:], record.parts)
+    odometry = interpolated(rows[:, 1], rows[:, 2:], record.parts)
     if record.parts > 1:
         slow = rate(len(rows), float(np.ptp(rows[:, 1])))
         hardly = ", and hardly show the bends" * (record.parts >= 10)  # half a second apart
         told = f"odometry samples at {slow} were interpolated, {record.parts} for one{hardly}"
         notes[f"{told} (--held takes each as in force until the next)"] += len(rows)
     if record.imu is not None:
-        odometry = Odometry(*twists.with_yaw_rate(odometry.t, odometry.twist, *record.imu))
+        odometry = Odometry(*with_yaw_rate(odometry.t, odometry.twist, *record.imu))
         _check_stamps(odometry.t, "odometry", file, notes)
     return Odometry(odometry.t, odometry.twist * frames.flip)
 
@@ -234,7 +250,7 @@ def _possible(record: Recording, rows: Array, file: Path) -> BoolArray:
     What is left out is a gap: the twist before it is held, and estimators doubt it the longer the more.
     """
     numbers, t, values = rows[:, 0].astype(int), rows[:, 1], rows[:, 2:]
-    beyond, off = twists.beyond_limits(values), twists.jumps(t, values)
+    beyond, off = beyond_limits(values), jumps(t, values)
     notes = record.notes
 
     def told(row: int, column: int) -> str:
@@ -242,39 +258,142 @@ def _possible(record: Recording, rows: Array, file: Path) -> BoolArray:
         return f"{name} = {values[row, column]:.4g} {unit}"
 
     wrong, jumped = beyond.any(axis=1), (off != 0.0).any(axis=1)
-    if wrong.mean() > twists.MOST_WRONG:
+    if wrong.mean() > MOST_WRONG:
         first, column = np.argwhere(beyond)[0].tolist()
-        most = twists.LIMITS
+        most = LIMITS
         limits = f"speeds of at most {most.speed:g} m/s and yaw rates of {most.yaw_rate:g} rad/s"
         where = f"at first {told(first, column)} in {record.at(numbers[first : first + 1])}"
-        unit = f" ({record.units})" if record.units else ""
-        found = f"found {wrong.sum()} of {len(t)} beyond, {where}: is the unit right{unit}?"
-        raise InputError(file, f"expected {limits}, {found}")
-    if jumped.sum() <= max(twists.MOST_WRONG * len(t), twists.FEW):  # else it is how this odometry is
+        found = f"found {wrong.sum()} of {len(t)} beyond, {where}"
+        raise InputError(file, f"expected {limits}, {found}{record.units and f' ({record.units})'}")
+    if jumped.sum() <= max(MOST_WRONG * len(t), FEW):  # else it is how this odometry is
         wrong = wrong | jumped
     if wrong.any():
         first = int(np.argmax(wrong))
-        size = beyond[first] if beyond[first].any() else np.abs(off[first]) / twists.ACCELERATIONS
+        size = beyond[first] if beyond[first].any() else np.abs(off[first]) / ACCELERATIONS
         column = int(np.argmax(size))
         cause = "a position jumps" if column < 2 else "a value jumps"
         turn = abs(off[first, 2]) * float(np.median(np.diff(t))) / np.pi
-        if column == 2 and min(abs(turn - 1.0), abs(turn - 2.0)) < 1.0 - twists.WRAP_SHARE:
+        if column == 2 and min(abs(turn - 1.0), abs(turn - 2.0)) < 1.0 - WRAP_SHARE:
             cause = "the yaw was differenced where it wraps by a whole turn"
         where = f"{told(first, column)}, where {cause}, in {record.at(numbers[wrong])}"
         notes[f"odometry samples can't be, and were left out as a gap: {where}"] += int(wrong.sum())
     return np.asarray(~wrong)
 
 
-def _check_stamps(t: Array, what: str, file: Path, notes: Counter[str]) -> None:
+def _check_stamps(t: Array, what: str, file: Path, notes: Counter[str], where: str = "") -> None:
     if len(t) == 0:
         raise InputError(file, "; ".join([f"expected {what} with stamps, found none", *_why(notes, what)]))
     worst = float(np.abs(t).max())
     if worst > MAX_STAMP:
-        raise InputError(file, f"expected stamps of {what} in s, at most {MAX_STAMP:g}, found {worst:g}")
+        raise InputError(
+            file, f"expected stamps of {what} in s, at most {MAX_STAMP:g}, found {worst:g}{where}"
+        )
 
 
 def _why(notes: Counter[str], what: str = "detections") -> list[str]:
     return [f"{number} {text}" for text, number in notes.items() if number and what in text]
+
+
+def twists_between(t: Array, poses: Array) -> Array:
+    """Constant twists (n - 1, 3) that lead from each pose (n, 3) at t (n,) in s to the next."""
+    moves = [relative(one, other) for one, other in pairwise(poses)]
+    logarithms = np.array([gtsam.Pose2.Logmap(gtsam.Pose2(*move)) for move in moves]).reshape(-1, 3)
+    return logarithms / np.diff(t)[:, None]
+
+
+def measured_anew(t: Array, poses: Array) -> BoolArray:
+    """Which poses (n, 3) at t (n,) in s differ from the one before, or stay for longer than `FROZEN`.
+
+    A slow receiver's pose is often repeated at the rate of a faster sensor: differences would be 0, 0, 5 v.
+    """
+    new = np.append(True, (np.diff(poses, axis=0) != 0.0).any(axis=1))
+    since = t - t[np.maximum.accumulate(np.where(new, np.arange(len(t)), 0))]
+    return np.asarray(new | (since > FROZEN))
+
+
+def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[Array, Array]:
+    """Replace the yaw rate of twists at t (n,) in s, in order, by the mean of an IMU until the next twist."""
+    turn = np.argsort(imu_t, kind="stable")
+    turn = turn[np.isfinite(rates[turn])]
+    imu_t, rates = imu_t[turn], rates[turn]
+    inside = (t >= imu_t[0]) & (t <= imu_t[-1]) if len(imu_t) else np.zeros(len(t), bool)
+    t, twists = t[inside], twists[inside]
+    if len(t) < 2:
+        return t, twists
+    heading = np.append(0.0, np.cumsum(rates[:-1] * np.diff(imu_t)))
+    steps, turned = np.diff(t), np.diff(np.interp(t, imu_t, heading))
+    last = rates[np.searchsorted(imu_t, t[-1], side="right") - 1]
+    mean = np.interp(t[:-1], imu_t, rates)  # where no time passes
+    np.divide(turned, steps, out=mean, where=steps > 0)
+    twists[:, 2] = np.append(mean, last)
+    return t, twists
+
+
+def beyond_limits(twists: Array) -> BoolArray:
+    """Which entries of twists (n, 3) are beyond what an estimator uses."""
+    return np.asarray(np.abs(twists) > [LIMITS.speed, LIMITS.speed, LIMITS.yaw_rate])
+
+
+def jumps(t: Array, twists: Array) -> Array:
+    """How far single rows of twists (n, 3) at t (n,) in s jump, and 0 for the others (n, 3).
+
+    A row x jumps if it lies outside the medians a and b of the rows before and after it by more than a
+    vehicle accelerates meanwhile, and more than the rows' noise:
+
+        max(x - max(a, b), min(a, b) - x) > AROUND A dt / 2 + 6 sigma
+
+    Up to two rows in turn can jump. A yaw rate may leave the medians by less than a share of pi / dt: one
+    that was differenced where the yaw wraps leaves them by 2 pi / dt, or in two rows by pi / dt.
+    """
+    if len(t) <= 2 * AROUND:
+        return np.zeros(twists.shape)
+    steps = np.diff(t)
+    dt = float(np.median(steps))
+    apart = np.maximum(np.maximum(np.append(dt, steps), np.append(steps, dt)), dt)  # more beside a gap
+    rows = np.pad(twists, ((AROUND, AROUND), (0, 0)), mode="reflect")
+    windows = np.lib.stride_tricks.sliding_window_view(rows, AROUND, axis=0)
+    before, after = np.median(windows[: len(t)], axis=-1), np.median(windows[AROUND + 1 :], axis=-1)
+    low, high = np.minimum(before, after), np.maximum(before, after)
+    off = twists - np.clip(twists, low, high)
+    middle = 0.5 * (twists[:-2] + twists[2:])
+    sigma = MAD * np.median(np.abs(twists[1:-1] - middle), axis=0) / np.sqrt(1.5)
+    most = 0.5 * AROUND * ACCELERATIONS * apart[:, None] + 6.0 * sigma
+    most[:, 2] = np.where(apart < 1.5 * dt, np.minimum(most[:, 2], WRAP_SHARE * np.pi / dt), most[:, 2])
+    return np.where(np.abs(off) > most, off, 0.0)
+
+
+def parts_of(t: Array) -> int:
+    """Number of parts of an interval of sampled twists at t (n,) in s, each `PERIOD` long at most.
+
+    It is 1 for periods up to 0.12 s, which can be held, for those of another unit than s, and for too few
+    samples to know their period.
+    """
+    steps = np.diff(np.unique(t[np.isfinite(t)]))
+    period = float(np.median(steps)) if len(steps) >= 20 else 0.0
+    return int(np.ceil(period / PERIOD - 1e-6)) if 0.12 < period < 5.0 else 1
+
+
+def interpolated(t: Array, twists: Array, parts: int) -> Odometry:
+    """Interpolate sampled twists (n, 3) at t (n,) in s: the mean of each of the parts of an interval.
+
+    A log holds each twist until the next one, so that a slow one would lag by half its period. Cubic splines
+    go through the samples between gaps, where the last twist is held.
+    """
+    if parts == 1 or len(t) < 2:
+        return Odometry(t, twists)
+    steps = np.diff(t)
+    ends = np.flatnonzero(steps > GAP * np.median(steps)) + 1
+    stamps, values = [], []
+    for run in np.split(np.arange(len(t)), ends):
+        at, own = t[run], twists[run]
+        if len(run) > 1:
+            begins = (at[:-1, None] + np.diff(at)[:, None] * (np.arange(parts) / parts)).ravel()
+            whole = CubicSpline(at, own).antiderivative()(np.append(begins, at[-1]))
+            stamps.append(begins)
+            values.append(np.diff(whole, axis=0) / np.diff(np.append(begins, at[-1]))[:, None])
+        stamps.append(at[-1:])
+        values.append(own[-1:])
+    return Odometry(np.concatenate(stamps), np.concatenate(values))
 
 
 # --- detections --------------------------------------------------------------------------------------------
@@ -341,7 +460,7 @@ def distinct(found: Points, notes: Counter[str]) -> Points:
     found = usable(found, notes)
     without = ~np.isfinite(found.covariances).all(axis=(1, 2))
     order = np.lexsort((without, found.labels == UNKNOWN))
-    pairs = KDTree(_places(found)[order]).query_pairs(REPEATED, output_type="ndarray")
+    pairs = KDTree(_places(found)[order]).query_pairs(0.02, output_type="ndarray")
     if not len(pairs):
         return found
     repeats = order[np.unique(pairs.max(axis=1))]
@@ -354,24 +473,22 @@ def _places(points: Points) -> Array:
     return np.column_stack([points.points, APART * points.message])
 
 
-def pairs_of_cones(points: Points, most: float | None = None) -> IntArray:
-    """Pairs (k, 2) of points nearest to one another, and far from all others, or `most` apart (m)."""
-    if len(points.labels) < 3:
-        return np.zeros((0, 2), int)
-    found = KDTree(_places(points)).query(_places(points), 3)
-    (_, first, second), (_, other, _) = np.asarray(found[0]).T, np.asarray(found[1]).T
-    own, close = np.arange(len(other)), first < (PAIRED * second if most is None else most)
-    mutual = close & close[other] & (other[other] == own) & (own < other) & (second < APART)
-    return np.asarray(np.column_stack([own, other])[mutual])
-
-
 def merged_pairs(found: Points, notes: Counter[str]) -> Points:
-    """Merge two detections of each cone to their mean, where most cones were reported twice."""
-    pairs = pairs_of_cones(found)
-    if 2 * len(pairs) <= MOST_PAIRED * len(found.labels):
+    """Merge two detections of each cone to their mean, where most cones were reported twice.
+
+    These are nearer to one another than by a quarter of the distance of the next detection.
+    """
+    if len(found.labels) < 3:
         return found
-    usual = float(np.median(np.hypot(*(found.points[pairs[:, 1]] - found.points[pairs[:, 0]]).T)))
-    one, other = pairs_of_cones(found, 2.0 * usual).T
+    tree = KDTree(_places(found))
+    first, second = np.asarray(tree.query(tree.data, 3)[0])[:, 1:].T
+    paired = (first < 0.25 * second) & (second < APART)
+    if 2 * paired.sum() <= len(paired):
+        return found
+    usual = float(np.median(first[paired]))
+    pairs = tree.query_pairs(2.0 * usual, output_type="ndarray")
+    of_one_pair = np.bincount(pairs.ravel(), minlength=len(paired)) == 1
+    one, other = pairs[of_one_pair[pairs].all(axis=1)].T
     told = f"detections lie in pairs, {usual:.2g} m apart, and were merged to one a cone"
     notes[told] += 2 * len(one)
     labels, points, covariances = found.labels.copy(), found.points.copy(), found.covariances.copy()
@@ -394,19 +511,19 @@ def in_vehicle_frame(
     covariances = found.covariances * np.outer(frames.sides, frames.sides)
     known = positive_definite(covariances) & (not noise.replace_covariances)
     notes[ASSUMED] += int((~known).sum())
-    assumed = ray_covariances(found.points * frames.sides, noise.sigmas)
+    assumed = logs.ray_covariances(found.points * frames.sides, noise.sigmas)
     covariances = np.where(known[:, None, None], covariances, assumed)
     turn = rotation((frames.mounting or (0.0, 0.0, 0.0))[2])
     turned = turn @ covariances @ turn.T
     symmetric = 0.5 * (turned + turned.transpose(0, 2, 1))
-    return Detections(t, in_vehicle(found.points, frames), symmetric, found.labels)
+    return Detections(t, from_sensor(found.points, frames), symmetric, found.labels)
 
 
 def positive_definite(covariances: Array) -> BoolArray:
     """Which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
     xx, xy, yx, yy = covariances.reshape(-1, 4).T
     with np.errstate(over="ignore", invalid="ignore"):
-        good = np.isfinite(covariances).all(axis=(1, 2)) & is_positive_definite(xx, xy, yy)
-        good &= np.abs(xy - yx) <= MAX_ASYMMETRY * np.maximum(xx, yy)
+        good = np.isfinite(covariances).all(axis=(1, 2)) & logs.is_positive_definite(xx, xy, yy)
+        good &= np.abs(xy - yx) <= 1e-3 * np.maximum(xx, yy)  # messages in single precision
         good &= np.maximum(xx, yy) < MAX_RANGE**2
     return np.asarray(good)

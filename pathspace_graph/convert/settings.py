@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.covariances import SIGMA_DETECTIONS
+from pathspace_graph.io.log import SIGMA_DETECTIONS
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.settings.checked import AT_LEAST_0, POSITIVE, AtLeast0, Checked, Signed, Unlimited
 
@@ -21,20 +21,15 @@ Side = Literal["left", "right"]  # side of the x axis to which the y axis points
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
 NO_LABEL: Final = "none"  # name of a label field that means no labels
 LEAST_SPACING: Final = 1e-3  # of points along a line (m)
-DEFAULT_LABELS: Final = ("left=0", "right=1")  # labels of numbers by default
 SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
 ORANGE_WORDS: Final = {"orange", "o"}
 BIG_WORDS: Final = {"big", "large"}
-# words of values that mean no side, and of colours, whose hue has decided
-UNKNOWN_WORDS: Final = {"unknown", "none", "other", "undefined", "uncolored", "colourless", "colour"}
-MOST_SHOWN: Final = 12  # number of label values in a line
 HUES: Final = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)}  # in degrees
-MIN_SATURATION: Final = 0.3  # least saturation of a colour that is not grey
 
 
 @dataclass(frozen=True)
-class BagOptions:
-    """Which messages of a bag are read, and how."""
+class Topics:
+    """Which messages of a bag, or files, are read, and how."""
 
     odometry: str | None = None
     """Topic of the odometry in a bag: any message with a twist, with a speed (then --imu or --wheelbase gives
@@ -88,19 +83,15 @@ class NoiseSettings(Checked, group=""):
             raise SettingsError("sigma_drift: expected sigma_odometry beside it, found none")
 
     @property
-    def _own(self) -> tuple[float | None, ...]:
+    def of_detections(self) -> tuple[float | None, ...]:
+        """What is stated of detections, in the order of `sigmas`."""
         return self.sigma_range, self.sigma_range_growth, self.sigma_bearing
 
     @property
     def sigmas(self) -> tuple[float, ...]:
         """Sigmas of the range at range 0 (m), of its growth (m/m), and of the bearing (rad)."""
-        pairs = zip(self._own, SIGMA_DETECTIONS, strict=True)
+        pairs = zip(self.of_detections, SIGMA_DETECTIONS, strict=True)
         return tuple(default if own is None else own for own, default in pairs)
-
-    @property
-    def states_detections(self) -> bool:
-        """Whether the noise of the detections is stated here."""
-        return any(own is not None for own in self._own)
 
 
 @dataclass(frozen=True)
@@ -168,7 +159,7 @@ class LabelRule:
         self.fields = (field,) if field else LABEL_FIELDS
         self._labels: dict[str, int] = {}
         self.met: Counter[tuple[str, int]] = Counter()  # values, by their text and the label they got
-        for pair in pairs or DEFAULT_LABELS:
+        for pair in pairs or ("left=0", "right=1"):
             name, equals, value = pair.partition("=")
             if not equals or name not in NAMES or not value:
                 raise SettingsError(f"--labels: expected LABEL=VALUE with a LABEL of {NAMES}, found '{pair}'")
@@ -192,21 +183,9 @@ class LabelRule:
 
     def summary(self) -> str:
         """One line with the labels of the most frequent values; empty where there are none."""
-        most = self.met.most_common(MOST_SHOWN)
+        most = self.met.most_common(12)
         values = [f"{text or 'empty'} is {NAMES[label]} ({count})" for (text, label), count in most]
         return f"labels: {', '.join(values)}{', ...' * (len(self.met) > len(most))}" if values else ""
-
-    def hint(self) -> str:
-        """Hint at values that may mean a side; empty where there are none."""
-        unknown = [text for (text, label), _ in self.met.most_common() if label == UNKNOWN]
-        unmapped = [text for text in unknown if label_words(text).isdisjoint(UNKNOWN_WORDS) and text]
-        if not unmapped:
-            return ""
-        known = {label for _, label in self.met}
-        meant = "orange" if {LEFT, RIGHT} <= known else "right" if LEFT in known else "left"
-        told = f"labels {', '.join(unmapped[:MOST_SHOWN])} are read as unknown"
-        others = f"left, right, orange and big_orange are known labels, as in --labels {meant}={unmapped[0]}"
-        return f"{told}: {others}"
 
 
 def _whole(text: str) -> str:
@@ -218,14 +197,9 @@ def _whole(text: str) -> str:
     return str(int(number)) if isfinite(number) and number == int(number) else text
 
 
-def label_words(text: str) -> set[str]:
-    """Words of a text in lower case: those of `Blue-cone` are blue and cone."""
-    return set(re.findall(r"[a-z]+", text.lower()))
-
-
 def label_of_words(text: str) -> int:
-    """Label of a text by its words; UNKNOWN where none or several are of a side."""
-    words = label_words(text)
+    """Label of a text by its words, as blue and cone in `Blue-cone`; UNKNOWN where none or several tell."""
+    words = {*re.findall(r"[a-z]+", text.lower())}
     if words & ORANGE_WORDS:
         return BIG_ORANGE if words & BIG_WORDS else ORANGE
     sides = [label for label, names in SIDE_WORDS.items() if words & names]
@@ -235,7 +209,7 @@ def label_of_words(text: str) -> int:
 def label_of_colour(red: float, green: float, blue: float) -> int:
     """Label of a blue, yellow or orange colour, UNKNOWN of any other; the scale is free."""
     most, least = max(red, green, blue), min(red, green, blue)
-    if not 0.0 < most < inf or not most - least > MIN_SATURATION * most:
+    if not 0.0 < most < inf or not most - least > 0.3 * most:  # it is grey
         return UNKNOWN
     hue = 360.0 * rgb_to_hsv(red, green, blue)[0]
     labels = [label for label, (low, high) in HUES.items() if low <= hue <= high]

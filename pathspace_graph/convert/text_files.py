@@ -2,24 +2,24 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import UTC, datetime
-from math import nan, pi
+from math import pi
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Final, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.covariances import covariances_of
-from pathspace_graph.io.parsing import MAX_STAMP, is_number, read_text, shown
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, covariances_of
+from pathspace_graph.io.parsing import is_number, read_text, shown
 from pathspace_graph.io.tables import DELIMITERS, TUM, read_table, read_trajectory, read_tum
 from pathspace_graph.labels import UNKNOWN
 
 from .messages import ALONE, BROKEN, Points, cone_points, scan_points, yaw_of
-from .recording import Recording
-from .settings import LabelRule
+from .recording import Recording, chosen_motion
+from .settings import LabelRule, Topics
 
 ODOMETRY: Final = "odometry"
 DETECTIONS: Final = "detections"
@@ -43,40 +43,34 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {  # units of each quantity, i
     "speed": {"m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/s": 1e3, "km/h": 1.0 / 3.6, "mph": 0.44704},
     "yaw_rate": {"rad/s": 1.0, "deg/s": pi / 180.0},
 }
-MAX_BEARING: Final = 2.0 * pi  # largest bearing (rad); more are degrees
 LARGEST: Final = 1e30  # largest number of a file; stamps in nanoseconds are large
-MANY_ROWS: Final = 20  # number of rows from which nanoseconds are checked
-LEAST_NANOSECONDS: Final = 1e6  # that fractions of so many rows reach
-MIN_PERIOD: Final = 1e-5  # least median period of samples (s); less is a wrong unit of time
-MAX_PERIOD: Final = 1e3  # largest median period of samples (s); more is a wrong unit of time
 
 
 def read_csv(
-    odometry: Path,
-    detections: Path,
-    rule: LabelRule,
-    columns: Sequence[str] = (),
-    units: Sequence[str] = (),
-    *,
-    from_poses: bool = False,
-    held: bool = False,
+    folder: Path, topics: Topics, rule: LabelRule, columns: Sequence[str] = (), units: Sequence[str] = ()
 ) -> Recording:
     """Read the drive in two CSV files; an InputError names file, row and column.
 
     Quantities are in columns of their own names, unless `columns` says `vx=speed`, `y=-cone_y` or
-    `odometry.t=stamp`, and in SI units, unless `units` says `length=mm angle=deg time=ns`. Stamps may be ISO
-    8601 dates, or seconds and nanoseconds in two columns (`t=sec+nsec`). The odometry has twists, or where
-    they are missing or `from_poses` is stated poses, which may be a trajectory in the format of TUM.
+    `odometry.t=stamp`, and in SI units, unless `units` says `length=mm angle=deg time=ns`. Stamps may be
+    seconds and nanoseconds in two columns (`t=sec+nsec`). The odometry has twists, or where they are missing
+    or the topics say so poses, which may be a trajectory in the format of TUM.
     """
+    odometry = folder / (topics.odometry or ODOMETRY_FILE)
+    detections = folder / (topics.detections or DETECTIONS_FILE)
     used = _units(units)
     first = (line.split() for line in read_text(odometry).splitlines() if line.strip() and line[0] != "#")
     words = next(first, [])
     if len(words) == len(TUM) and all(map(is_number, words)):
         (t, motion), are_poses, rows = read_trajectory(odometry), True, read_tum(odometry).rows
     else:
-        file = _File(ODOMETRY, odometry, columns, used)
-        (motion, are_poses), t, rows = _motion(file, from_poses=from_poses), file.stamps(), file.table.rows
-    scans = _scans(_File(DETECTIONS, detections, columns, used), rule)
+        file = _Columns(ODOMETRY, odometry, columns, used)
+        (motion, are_poses), t, rows = (
+            _motion(file, from_poses=topics.from_poses),
+            file.stamps(),
+            file.table.rows,
+        )
+    scans = _scans(_Columns(DETECTIONS, detections, columns, used), rule)
     in_words = ", ".join(f"{quantity} in {unit}" for quantity, unit in sorted(used.items()))
     return Recording(
         t,
@@ -84,10 +78,10 @@ def read_csv(
         *scans,
         {"odometry": odometry.name, "detections": detections.name, "units": in_words},
         are_poses=are_poses,
-        is_held=held,
+        is_held=topics.held,
         rows=rows,
         place=f"{odometry.name}, row",
-        units="--units speed=km/h yaw_rate=deg/s",
+        units="--units states others, as speed=km/h yaw_rate=deg/s angle=deg",
     )
 
 
@@ -104,11 +98,11 @@ def _units(pairs: Sequence[str]) -> dict[str, str]:
     return {"speed": f"{names['length']}/s", "yaw_rate": f"{names['angle']}/s", **names}
 
 
-class _File:
-    """One of the files, whose columns are read by quantity and in SI units."""
+class _Columns:
+    """Columns of one of the files by quantity: numbers in SI units, NaN where one is missing, or texts."""
 
     def __init__(self, kind: str, file: Path, pairs: Sequence[str], units: Mapping[str, str]) -> None:
-        self.named, self._units, self._quantities = dict[str, str](), units, QUANTITIES[kind]
+        named, self._kind, self._units = dict[str, str](), kind, units
         for pair in pairs:
             stated, _, name = pair.partition("=")
             only, _, key = stated.rpartition(".")
@@ -117,138 +111,106 @@ class _File:
             known = {key: 0 for of, keys in QUANTITIES.items() if only in ("", of) for key in keys}
             check_name(key, known, f"--columns: expected one of {', '.join(known)} in '{pair}'")
             if only in ("", kind):
-                self.named[key] = name
+                named[key] = name
         self.table = read_table(file, delimiters=DELIMITERS)
         if any(map(is_number, self.table.columns)):
-            found = f"found the numbers {', '.join(self.table.columns)}"
-            raise InputError(file, f"expected a header with the names of the columns, {found}", 1)
+            self._fail("expected a header with the names of the columns")
         if not len(self.table):
             raise InputError(file, "expected at least one row, found a header only", 2)
+        self.stated, found = {*named}, {k: v for k, v in OTHER_NAMES.items() if v in self.table.columns}
+        self.named = found | {key: key for key in QUANTITIES[kind] if key in self.table.columns} | named
 
-    def has(self, key: str) -> bool:
-        """Whether the file has the column of a quantity; one that was named must be there."""
-        return key in self.named or key in self.table.columns
+    def __contains__(self, key: str) -> bool:
+        return key in self.named
 
-    def find(self, key: str) -> str:
-        """Column of a quantity, by the name that was stated or by a usual one; empty without one."""
-        names = self.named.get(key, "").removeprefix("-"), key, OTHER_NAMES.get(key)
-        return next((name for name in names if name in self.table.columns), "")
+    def has(self, *keys: str) -> bool:
+        """Whether the file has all of these, also by a name that was stated for the other file."""
+        return all(self.named.get(key, "").removeprefix("-") in self.table.columns for key in keys)
 
-    def column(self, key: str, name: str = "") -> str:
-        """Column of a quantity, which must be there."""
-        name = name or self.named.get(key, key).removeprefix("-")
+    def require(self, *keys: str, otherwise: str = "") -> None:
+        """Raise an InputError where a quantity is not in the file."""
+        for key in keys:
+            if key not in self:
+                self._fail(f"expected a column '{key}'{otherwise} (--columns {key}=NAME)")
+
+    def texts(self, key: str) -> NDArray[Any]:
+        name = self.named[key].removeprefix("-")
         if name not in self.table.columns:
-            otherwise = f", or {key}=SECONDS+NANOSECONDS" * (key == "t")
-            pose = ", or a pose x, y, yaw" * (key in ("vx", "wz"))
-            self.fail(f"expected a column '{name}' for {key}{pose} (--columns {key}=NAME{otherwise})")
-        return name
+            self._fail(f"expected a column '{name}' for {key}")
+        return self.table.columns[name]
 
-    def fail(self, expected: str) -> NoReturn:
-        """Raise an InputError that lists the columns."""
-        raise InputError(self.table.file, f"{expected}, found the columns {', '.join(self.table.columns)}", 1)
-
-    def numbers(self, key: str, power: int = 1, name: str = "") -> Array:
-        """A column (rows,) in the SI unit or, for `power` 2, its square; NaN where it is missing."""
-        quantity = self._quantities[key]
-        sign = -1.0 if self.named.get(key, "").startswith("-") else 1.0
-        factor = sign * (UNITS[quantity][self._units[quantity]] ** power if quantity else 1.0)
-        return np.asarray(factor * self.table.numbers(self.column(key, name), LARGEST, missing=True))
+    def __getitem__(self, key: str) -> Array:
+        quantity, name = QUANTITIES[self._kind][key], self.named[key]
+        factor = UNITS[quantity][self._units[quantity]] if quantity else 1.0
+        self.texts(key)
+        numbers = self.table.numbers(name.removeprefix("-"), LARGEST, missing=True)
+        return (-1.0 if name.startswith("-") else 1.0) * factor ** (2 if key in COVARIANCE else 1) * numbers
 
     def stamps(self) -> Array:
-        """Stamps (rows,) in s: numbers, dates, or seconds and nanoseconds in two columns."""
-        stated, unit, table = self.named.get("t", "t"), self._units["time"], self.table
-        if "+" in stated and stated not in table.columns:
-            names = stated.split("+", 1)
-            t, fractions = (table.numbers(self.column("t", name), LARGEST) for name in names)
-            expected = f"expected nanoseconds from 0 to 999999999 in column '{names[1]}', found others"
-            table.require((fractions >= 0.0) & (fractions < 1e9), expected)
-            if len(t) >= MANY_ROWS and 0.0 < fractions.max() < LEAST_NANOSECONDS:
-                found = f"found at most {fractions.max():.0f}: is their unit another one?"
-                raise InputError(table.file, f"expected nanoseconds in column '{names[1]}', {found}")
-            t, unit = t + 1e-9 * fractions, "s"
-        elif np.isnan(seconds_of_date(table.columns[self.column("t")][0])):
-            t = UNITS["time"][unit] * table.numbers(self.column("t"), LARGEST)
-        else:
-            t, unit = np.array([seconds_of_date(text) for text in table.columns[self.column("t")]]), "s"
-            expected = f"expected a date by ISO 8601 in column '{stated}', as in the rows before"
-            table.require(~np.isnan(t), expected)
-        most = f"expected stamps of at most {MAX_STAMP:g} s in column '{stated}', found more"
-        table.require(np.abs(t) <= MAX_STAMP, f"{most}: is their unit not {unit} (--units time=ns)?")
-        stamps = np.unique(t)
-        period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
-        if not MIN_PERIOD < period < MAX_PERIOD:
-            found = f"found them {period:.3g} s apart: is their unit another one?"
-            raise InputError(table.file, f"expected stamps in {unit} in column '{stated}', {found}")
-        return np.asarray(t)
+        """Stamps (rows,) in s, also of seconds and nanoseconds in two columns."""
+        self.require("t", otherwise=", or t=SECONDS+NANOSECONDS")
+        seconds, plus, fraction = self.named["t"].partition("+")
+        if not plus:
+            self.texts("t")
+            return UNITS["time"][self._units["time"]] * self.table.numbers(seconds, LARGEST)
+        t, nanoseconds = self.table.stack((seconds, fraction), LARGEST).T
+        expected = f"expected nanoseconds from 0 to 999999999 in column '{fraction}', found others"
+        self.table.require((nanoseconds >= 0.0) & (nanoseconds < 1e9), expected)
+        return np.asarray(t + 1e-9 * nanoseconds)
+
+    def _fail(self, expected: str) -> NoReturn:
+        listed = ", ".join(self.table.columns)
+        raise InputError(self.table.file, f"{expected}, found the columns {listed}", 1)
 
 
-def seconds_of_date(text: str) -> float:
-    """Time (s) since 1970 of a date with a time by ISO 8601, UTC without an offset; else NaN."""
-    try:
-        date = datetime.fromisoformat("" if is_number(text) else text.strip())
-    except ValueError:
-        return nan
-    return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
-
-
-def _motion(file: _File, *, from_poses: bool) -> tuple[Array, bool]:
+def _motion(file: _Columns, *, from_poses: bool) -> tuple[Array, bool]:
     """Twists (rows, 3) or poses (rows, 3) of the odometry, with NaN where they are missing; and which."""
-    x, y, yaw = (file.find(key) for key in ("x", "y", "yaw"))
-    turned = [file.find(key) for key in QUATERNION]
-    has_poses = bool(x and y and (yaw or all(turned)))
-    if from_poses and not has_poses:
-        file.fail("--from-poses: expected the columns x, y and yaw, or a quaternion (--columns yaw=NAME)")
-    if has_poses and (from_poses or not (file.has("vx") and file.has("wz"))):
-        if not yaw:
-            turn = (file.numbers(key, name=name) for key, name in zip(QUATERNION, turned, strict=True))
-            heading = np.asarray(yaw_of(SimpleNamespace(**dict(zip("xyzw", turn, strict=True)))))
-        else:
-            heading = file.numbers("yaw", name=yaw)
-        return np.column_stack([file.numbers("x", name=x), file.numbers("y", name=y), heading]), True
-    vx, wz = file.numbers("vx"), file.numbers("wz")
-    vy = file.numbers("vy") if file.has("vy") else np.zeros(len(vx))
-    twists = np.column_stack([vx, vy, wz])
-    if has_poses and not np.nan_to_num(twists).any() and np.ptp(file.numbers("x", name=x)) > 0.0:
-        found = "found zeros while the pose moves; --from-poses makes the twists from the poses"
-        raise InputError(file.table.file, f"expected twists, {found}")
-    return twists, False
+    twists, poses = None, None
+    if file.has("x", "y", "yaw"):
+        poses = np.column_stack([file[key] for key in ("x", "y", "yaw")])
+    elif file.has("x", "y", *QUATERNION):
+        turn = SimpleNamespace(**{key[1]: file[key] for key in QUATERNION})
+        poses = np.column_stack([file["x"], file["y"], yaw_of(turn)])
+    elif from_poses:
+        file.require("x", "y", "yaw", otherwise=" for --from-poses")
+    else:
+        file.require("vx", "wz", otherwise=", or a pose x, y, yaw")
+    if "vx" in file and "wz" in file:
+        vy = file["vy"] if "vy" in file else np.zeros(len(file.table))
+        twists = np.column_stack([file["vx"], vy, file["wz"]])
+    return chosen_motion(twists, poses, "the odometry", file.table.file, from_poses=from_poses)
 
 
-def _scans(file: _File, rule: LabelRule) -> tuple[Array, Points]:
+def _scans(file: _Columns, rule: LabelRule) -> tuple[Array, Points]:
     """Stamps of the perception cycles (n,) in s, and their points, in the file's order."""
-    t, points, table = file.stamps(), _points(file), file.table
+    t = file.stamps()
+    if "range" in file.named and ("x" not in file or "range" in file.stated):
+        file.require("bearing")
+        ranges, bearings = file["range"], file["bearing"]
+        file.table.require(~(ranges < 0.0), "expected ranges of at least 0")
+        points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
+    else:
+        file.require("x", "y", otherwise=", or range and bearing")
+        points = np.column_stack([file["x"], file["y"]])
     covariances, labels, lines = None, np.full(len(t), UNKNOWN), np.full(len(t), ALONE)
-    if any(map(file.has, COVARIANCE)):
-        covariances = covariances_of(*(file.numbers(key, power=2) for key in COVARIANCE))
-    if file.has("label"):
-        labels = rule.of_all(table.columns[file.column("label")])
-    if "line" in file.named:
-        lines = np.unique(table.columns[file.column("line")], return_inverse=True)[1]
+    if any(key in file for key in COVARIANCE):
+        file.require(*COVARIANCE)
+        covariances = covariances_of(*(file[key] for key in COVARIANCE))
+    if "label" in file:
+        labels = rule.of_all(file.texts("label"))
+    if "line" in file:
+        lines = np.unique(file.texts("line"), return_inverse=True)[1]
     begins = np.diff(t, prepend=np.nan) != 0.0
     detections = Points.of(points, labels, covariances, lines)
     return t[begins], detections._replace(message=np.cumsum(begins) - 1)
 
 
-def _points(file: _File) -> Array:
-    if file.has("x") and "range" not in file.named:
-        return np.column_stack([file.numbers("x"), file.numbers("y")])
-    if not (file.has("range") and file.has("bearing")):
-        file.fail("expected the columns x and y, or range and bearing (--columns x=NAME)")
-    ranges, bearings = file.numbers("range"), file.numbers("bearing")
-    most = f"expected bearings of at most a whole turn in column '{file.column('bearing')}', found more"
-    file.table.require(~(np.abs(bearings) > MAX_BEARING), f"{most}: are they in degrees (--units angle=deg)?")
-    file.table.require(~(ranges < 0.0), f"expected ranges of at least 0 in column '{file.column('range')}'")
-    return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
-
-
-def read_json_lines(
-    file: Path, rule: LabelRule, *, from_poses: bool = False, held: bool = False
-) -> Recording:
+def read_json_lines(file: Path, topics: Topics, rule: LabelRule) -> Recording:
     """Read the drive in a file of JSON lines, in SI units; an InputError names file and line.
 
     A line is `{"t": s, "twist": [vx, vy, wz]}` or `{"t": s, "detections": [{"x": m, "y": m, "label": "blue",
     "covariance": [[xx, xy], [xy, yy]]}, ...]}`, or both. Label and covariance are optional, and `range` and
-    `bearing` may replace `x` and `y`. Where there is no twist, or `from_poses` is stated, the motion is that
+    `bearing` may replace `x` and `y`. Where there is no twist, or the topics say so, the motion is that
     of `"pose": [x, y, yaw]`. Instead of detections a line may have
     `"polylines": [{"points": [[x, y], ...], "label": "left"}, ...]` or a scan as of a `LaserScan`:
     `"scan": {"angle_min": rad, "angle_increment": rad, "range_min": m, "range_max": m, "ranges": [m, ...]}`.
@@ -271,8 +233,8 @@ def read_json_lines(
             raise InputError(file, f"{expected}, {told}", row) from None
         scan_t += [stamp] * len(points)
         scans += points
-    are_poses = bool(from_poses or (moved["pose"] and not moved["twist"]))
-    if from_poses and not moved["pose"]:
+    are_poses = bool(topics.from_poses or (moved["pose"] and not moved["twist"]))
+    if topics.from_poses and not moved["pose"]:
         raise InputError(file, "--from-poses: expected lines with pose [x, y, yaw], found none")
     entries = moved["pose" if are_poses else "twist"]
     return Recording(
@@ -282,7 +244,7 @@ def read_json_lines(
         Points.joined(scans),
         {"file": file.name},
         are_poses=are_poses,
-        is_held=held,
+        is_held=topics.held,
         rows=np.array([row for row, _, _ in entries], int),
         place=f"{file.name}, line",
     )

@@ -24,7 +24,7 @@ from .map import Map, MapBoundary, PointBoundary, SplineBoundary
 
 CENTRE_LINE: Final = ("# x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # columns of TUM's raceline format
 PROFILE: Final = ("# s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2")  # of its trajectories
-_FEWEST_INTERVALS: Final = 4  # least number of intervals of a sampled boundary
+_FEWEST_INTERVALS: Final = 4  # least number of intervals of a spaced boundary
 
 
 def write_centre_line(file: Path, track: Map, step: float) -> None:
@@ -60,10 +60,10 @@ def write_points(file: Path, track: Map, step: float) -> None:
 
 def boundary_points(boundary: MapBoundary, step: float) -> Array:
     """Points (n, 2) of a boundary about `step` (m) apart along it, or its landmarks."""
-    return boundary.points if isinstance(boundary, PointBoundary) else sampled(boundary.spline, step)
+    return boundary.points if isinstance(boundary, PointBoundary) else spaced(boundary.spline, step)
 
 
-def sampled(spline: BSpline, step: float, fewest: int = _FEWEST_INTERVALS) -> Array:
+def spaced(spline: BSpline, step: float, fewest: int = _FEWEST_INTERVALS) -> Array:
     """Points (n, 2) of a curve about `step` (m) apart; the first of a closed one isn't repeated."""
     length = spline.length()
     at = np.linspace(0.0, length, max(round(length / step), fewest) + 1)
@@ -220,7 +220,7 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
 def _pieces(spline: BSpline, cuts: Array, step: float) -> list[Array]:
     """Points (n, 2) of each stretch between cuts, without its last one, or of an open curve."""
     if not len(cuts):
-        return [sampled(spline, step, _FEWEST_WAY_INTERVALS)]
+        return [spaced(spline, step, _FEWEST_WAY_INTERVALS)]
     length, (low, high) = spline.length(), spline.domain
     begins = spline.arc_length(low + np.mod(cuts - low, high - low))
     begins = begins[0] + np.mod(begins - begins[0], length)

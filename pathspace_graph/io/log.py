@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
+from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.labels import NAMES, UNKNOWN, Kind, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
 
 from . import parsing as limits
 from .brief import Brief, pictures
-from .covariances import SIGMA_DETECTIONS, covariances_of, is_positive_definite, ray_covariances
 from .parsing import Column, Table
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ TRUTH_FILES: Final = (TRUTH_POSES_FILE, TRUTH_CONES_FILE, TRUTH_ASSOCIATIONS_FIL
 FILES: Final = (LOG_FILE, *COLUMNS)
 
 SIGMA_ODOMETRY: Final = (0.25, 0.12, 0.035)  # of a twist (m/s, m/s, rad/s) where nothing is known
+SIGMA_DETECTIONS: Final = (0.05, 0.012, np.pi / 200.0)  # (m, m/m, rad) where nothing is known
 MIN_INTERVAL: Final = 1e-3  # s between perception cycles; below, the odometry is too certain for doubles
 ROUND_OFF: Final = 1e-6  # s, of the difference of two stamps: doubles resolve those since 1970 to 2.4e-7 s
 MAX_HOLD: Final = 1.0  # s; a perception cycle later after the last twist has no odometry
@@ -75,6 +76,10 @@ class Odometry(Brief):
         first = int(np.searchsorted(self.t, start, side="right")) - 1
         stop = max(first, int(np.searchsorted(self.t, end, side="left"))) if end > start else first
         return Odometry(np.maximum(self.t[first:stop], start), self.twist[first:stop])
+
+    def poses(self) -> Array:
+        """Poses (N, 3) at the stamps by dead reckoning, from the origin at the first."""
+        return np.vstack([np.zeros((1, 3)), integrate_poses(np.diff(self.t), self.twist[:-1])])
 
     def followed_by(self, later: Odometry) -> Odometry:
         """Append the later twists that are newer."""
@@ -234,8 +239,9 @@ class Log:
         K = np.asarray(ray_covariances(points, SIGMA_DETECTIONS) if m is None else m, float).reshape(-1, 4)
         words = [label_from_name(one) if isinstance(one, str) else one for one in labels or ()]
         labelled = words if labels is not None else np.full(len(points), UNKNOWN)
-        odometry = odometry_of(_of_arrays(ODOMETRY_FILE, t, twist))
-        found = _of_arrays(DETECTIONS_FILE, detection_t, points, labelled, K[:, [0, 1, 3]])
+        odometry = odometry_of(Table.of_arrays(Path("odometry"), COLUMNS[ODOMETRY_FILE], t, twist))
+        columns = COLUMNS[DETECTIONS_FILE]
+        found = Table.of_arrays(Path("detections"), columns, detection_t, points, labelled, K[:, [0, 1, 3]])
         return cls(
             odometry,
             cycles_in(found, float(odometry.t[0]), float(odometry.t[-1])),
@@ -252,14 +258,10 @@ class Log:
 
     @property
     def noise(self) -> KnownNoise:
-        """Return the noise as an estimator takes it, divided by the scale of the scene."""
+        """Noise as an estimator takes it, divided by the scale of the scene."""
         stated = self.odometry_stated, self.detections_stated
         scale, drift = self.sensor.sigma_range_scale, self.odometry_drift
         return scaled(KnownNoise(self.odometry_sigma, *stated, self.measured, scale, drift), 1.0 / self.scale)
-
-
-def _of_arrays(name: str, *values: ArrayLike) -> Table:
-    return Table.of_arrays(Path(name).with_suffix(""), COLUMNS[name], *values)
 
 
 def odometry_of(table: Table) -> Odometry:
@@ -326,3 +328,35 @@ def labels_of(table: Table) -> IntArray:
         return table.numbers("label").astype(int)
     known = {word: label_from_name(word) for word in set(column)}
     return np.array([known[word] for word in column], dtype=int)
+
+
+# --- covariances of detections ---------------------------------------------------------------------------
+
+
+def covariances_of(xx: Array, xy: Array, yy: Array) -> Array:
+    return np.stack([xx, xy, xy, yy], axis=-1).reshape(-1, 2, 2)
+
+
+def polar_covariances(bearings: Array, along: Array, across: Array) -> Array:
+    """`R(b) diag(along, across) R(b)^T` (m, 2, 2) of variances (m,) along rays and across them."""
+    c, s = np.cos(bearings), np.sin(bearings)
+    xx, yy = c * c * along + s * s * across, s * s * along + c * c * across
+    return covariances_of(xx, c * s * (along - across), yy)
+
+
+def ray_covariances(points: Array, sigmas: Iterable[float]) -> Array:
+    """Covariances (m, 2, 2) by (s_range, s_growth, s_bearing) of points (m, 2) at ranges r.
+
+    `(s_range + s_growth r)^2` along the ray, `(r s_bearing)^2` across it.
+    """
+    ranges, bearings = np.hypot(*points.T), np.arctan2(points[:, 1], points[:, 0])
+    begin, growth, bearing = sigmas
+    across = (np.maximum(ranges, 1.0) * bearing) ** 2  # K > 0 at the sensor, too
+    return polar_covariances(bearings, (begin + growth * ranges) ** 2, across)
+
+
+def is_positive_definite(xx: Array, xy: Array, yy: Array) -> BoolArray:
+    """Which covariances (m,) are positive definite, by their entries."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        good = (xx > 0) & (yy > 0) & (xx * yy - xy * xy > 1e-12 * xx * yy)  # singular to doubles below
+    return np.asarray(good)

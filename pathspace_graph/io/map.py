@@ -30,8 +30,6 @@ FORMAT = "pathspace-map/1"
 MAP_FILE = "map.json"
 NO_COVARIANCE: Final[Array] = np.zeros((0, 0))  # not requested; such a map can't be written
 NO_CONES: Final[Array] = np.zeros((0, 2))
-_SYMMETRY_TOLERANCE = 1e-9  # largest |P - P^T| over max|P| of a covariance that is symmetric to rounding
-_NEGATIVE_TOLERANCE = 1e-9  # most negative eigenvalue over the largest one of P >= 0, to rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -350,12 +348,13 @@ def _joint(cross: Matrix, boundaries: Mapping[int, MapBoundary], file: Path) -> 
 
 
 def _is_covariance(P: Array) -> bool:
+    """Whether a matrix is symmetric and positive semidefinite, to rounding."""
     if P.size == 0:
         return True
-    if np.abs(P - P.T).max() > _SYMMETRY_TOLERANCE * np.abs(P).max():
+    if np.abs(P - P.T).max() > 1e-9 * np.abs(P).max():
         return False
     eigenvalues = np.linalg.eigvalsh(P)
-    return bool(eigenvalues[0] >= -_NEGATIVE_TOLERANCE * max(eigenvalues[-1], 0.0))
+    return bool(eigenvalues[0] >= -1e-9 * max(eigenvalues[-1], 0.0))
 
 
 def read_map(folder: Path | str) -> Map:
@@ -373,7 +372,7 @@ def as_ribbon(track: Map, sigma_shape: float) -> Map:
     `sigma_shape` (m) is what a ribbon cannot follow, one sigma, added to each control point of its edges.
     """
     ribbon, covariance, until = ribbon_of(track)
-    return replace(map_of(ribbon, covariance, sigma_shape, until), points=track.points)
+    return replace(map_of_ribbon(ribbon, covariance, sigma_shape, until), points=track.points)
 
 
 def ribbon_of(track: Map) -> tuple[Ribbon, Array | None, dict[int, float]]:
@@ -392,7 +391,9 @@ def ribbon_of(track: Map) -> tuple[Ribbon, Array | None, dict[int, float]]:
     return line.ribbon, None if P is None else line.by_boundaries @ P @ line.by_boundaries.T, until
 
 
-def map_of(ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]) -> Map:
+def map_of_ribbon(
+    ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]
+) -> Map:
     """Build the map of the edges of a ribbon, with the covariance (3m, 3m) of its control points, if known.
 
     `sigma_shape` (m) is added to each control point. Open edges are confirmed up to the parameters `until`.

@@ -42,14 +42,14 @@ def override(settings: T, overrides: Overrides, where: str) -> T:
 def apart(
     overrides: Overrides, estimators: Iterable[str], settings: Any
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the overrides of settings, and those of estimators' own parameters, `NAME.field`."""
+    """Overrides of settings, and those of estimators' own parameters, `NAME.field`."""
     known, names = leaves(settings), set(estimators)
     own = {k: v for k, v in overrides.items() if k not in known and k.partition(".")[0] in names}
     return {k: v for k, v in overrides.items() if k not in own}, own
 
 
 def read_settings(file: Path, settings: T, estimators: Iterable[str] = ()) -> tuple[T, dict[str, Any]]:
-    """Return the settings with those of a file, and the own parameters of some estimators that it has.
+    """Settings with those of a file, and the own parameters of some estimators that it has.
 
     The file is TOML or a run's `summary.json`. An InputError says what is wrong with the settings.
     """

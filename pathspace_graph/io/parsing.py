@@ -3,7 +3,6 @@
 import re
 import stat
 import tomllib
-from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -55,7 +54,7 @@ def shown(value: Any) -> str:
 
 
 def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> str:
-    """Read the text of a file in UTF-8, or in UTF-16 with a byte-order mark, of at most `most` bytes.
+    """Read the text of a file in UTF-8 of at most `most` bytes.
 
     An InputError says what was `expected`.
     """
@@ -66,7 +65,7 @@ def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) 
         if found.st_size > most:
             raise InputError(file, f"expected at most {most} bytes, found more")
         data = file.read_bytes()
-        return data.decode("utf-16" if data.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
+        return data.decode("utf-8-sig")
     except FileNotFoundError:
         raise InputError(file, f"expected {expected}, found none") from None
     except OSError as error:

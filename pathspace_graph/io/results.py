@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE
+from pathspace_graph.factors.odometry import CALIBRATION, CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
@@ -21,7 +21,6 @@ from pathspace_graph.provenance import made
 
 from .brief import Brief, frames
 from .files import atomic_folder, write_json, write_table
-from .header import CALIBRATION
 from .map import MAP_FILE, Map, map_to_json
 
 if TYPE_CHECKING:

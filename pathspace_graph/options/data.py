@@ -7,11 +7,11 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from pathspace_graph.convert.settings import BagOptions, Frames, NoiseSettings, Window
+from pathspace_graph.convert.settings import Frames, NoiseSettings, Topics, Window
 from pathspace_graph.sim.simulate import PRESETS, SimulationSettings, preset
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings
 
-from .map import INLINE, FolderCommand
+from .runs import INLINE, FolderCommand
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ class Convert(FolderCommand):
     """Folder for the log."""
     kind: Annotated[Literal["bag", "csv", "jsonl"], Parameter(name="--from")] = "bag"
     """Kind of the record."""
-    topics: Annotated[BagOptions, INLINE] = field(default_factory=BagOptions)
+    topics: Annotated[Topics, INLINE] = field(default_factory=Topics)
     """Messages of a bag."""
     label_field: str | None = None
     """Field of the label of a detection in a bag; `none` means that there are no labels."""

@@ -1,8 +1,14 @@
-"""Check of a log before it is mapped: hints about likely mistakes, also for a log that is refused."""
+"""Check of a log before it is mapped: hints about likely mistakes, also for a log that is refused.
 
+The texts of the hints are a table, `hints.csv`.
+"""
+
+import csv
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.resources import files
 from itertools import chain
 from math import hypot
 from pathlib import Path
@@ -10,39 +16,88 @@ from typing import Any, Final
 
 import numpy as np
 import scipy  # imports its modules lazily
+from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.errors import InputError, check_type
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.front_end.gate import check_usable
+from pathspace_graph.factors.noise import ASSUMED_DRIFT, ray_sigmas
+from pathspace_graph.factors.se2 import move_points, relative
+from pathspace_graph.front_end.front_end import measure_log
+from pathspace_graph.front_end.gate import TWIST, check_usable
+from pathspace_graph.front_end.measurement import LEAST_NOISE
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
+from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_UNKNOWN, TwistRecord
 from pathspace_graph.io import log as logs
-from pathspace_graph.io.covariances import covariances_of
-from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Log, Odometry
+from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, covariances_of
 from pathspace_graph.io.log_files import read_log
 from pathspace_graph.io.parsing import shown
 from pathspace_graph.io.tables import read_table
-from pathspace_graph.labels import LEFT, NAMES, RIGHT, UNKNOWN
+from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.settings.online import LimitSettings
 
-from .diagnosis import noise_hints
-from .hint import Hint, because, hint_of
-from .kind import is_line
-from .regression import Better, Complex, Fit, Regression, far_better, motions_of
+from .regression import Better, Complex, Fit, Regression, dead_reckoned, far_better, motions_of
+
+SURVIVABLE: Final = {"gaps", "reach", "mounting", "covariances", "labels", "noise", "sides"}
+"""Causes in spite of which a map can be right."""
+
+
+@dataclass(frozen=True)
+class Hint:
+    """A likely mistake in a log; lengths in its texts are in metres of the log."""
+
+    cause: str
+    """Kind of the mistake."""
+    file: str
+    columns: str
+    """Columns of the file."""
+    found: str
+    """Finding, with its figure."""
+    likely: str
+    """Likely cause."""
+    advice: str
+    """Correction."""
+
+    @property
+    def line(self) -> str:
+        return f"{self.file}, {self.columns}: {self.found}; likely cause: {self.likely}; {self.advice}"
+
+
+with (files(__package__) / "hints.csv").open(encoding="utf-8") as _file:
+    TEXTS: Final = {row.pop("mistake"): row for row in csv.DictReader(_file)}
+    """Fields of the hint of each mistake, with places for its figures."""
+
+
+def hint_of(mistake: str, **figures: Any) -> Hint:
+    return Hint(**{name: text.format(**figures) for name, text in TEXTS[mistake].items()})
+
+
+def because(hints: Sequence[Hint]) -> str:
+    """Likely causes of a refusal in words; empty without hints."""
+    causes = [f"{hint.likely} ({hint.file}, {hint.columns}: {hint.found})" for hint in hints]
+    return f"likely cause: {'; '.join(causes)}" if causes else ""
+
+
+def objections(hints: Sequence[Hint]) -> list[str]:
+    """Why the map of a log with these hints is wrong; empty if all are `SURVIVABLE`."""
+    likely = [hint.likely for hint in hints if hint.cause not in SURVIVABLE]
+    return [f"not a map of the drive: {'; '.join(likely)}"] if likely else []
+
+
+# --- the check -----------------------------------------------------------------------------------------
 
 LARGEST_READING: Final = 1e20  # largest number in a log for hints
-LEAST_TWISTS: Final = 20  # least number of twists for hints
 
 
 def hints(log: Log) -> list[Hint]:
-    """Return hints about likely mistakes in a log; those by motion are the strongest first.
+    """Hints about likely mistakes in a log; those by motion are the strongest first.
 
     There are none for weak evidence, nor for numbers that are not finite.
     """
     check_type("log", log, Log)
     arrays = ((cycle.points_vehicle, cycle.covariances) for cycle in log.cycles)
     parts = (*_stamps(log).values(), log.odometry.twist, *chain.from_iterable(arrays))
-    if len(log.odometry.t) < LEAST_TWISTS or any(not (np.abs(one) <= LARGEST_READING).all() for one in parts):
+    if len(log.odometry.t) < 20 or any(not (np.abs(one) <= LARGEST_READING).all() for one in parts):
         return []
     if of_parts := parts_of_stamps(log):
         return of_parts
@@ -57,35 +112,25 @@ def hints(log: Log) -> list[Hint]:
     stay = log.sensor.kind != "line" and not is_line(log)
     with threadpool_limits(limits=1):
         found += of_positions + of_rows + (camera(log) or motion_hints(log))
-        found = found or side_hints(log) or of_kind(log)
+        found = found or side_hints(log) or kind_hints(log)
         if stay:
             found = found or one_label(log)
-    return of_cycles + (found or noise_hints(log, stay=stay))
+    if not found:
+        found += _odometry_hints(log) if log.odometry_stated else []
+        found += _detection_hints(log) if log.detections_stated and stay else []
+    return of_cycles + found
 
 
 # --- stamps, units and rows by typical values ------------------------------------------------------------
 
 TIME_UNITS: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size (s)
 LENGTH_UNITS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # by size (m)
-USUAL_STEPS: Final = 2e-4, 5.0  # shortest and longest usual time between rows (s)
 WITHOUT_DETECTIONS: Final = 10.0  # longest drive before the first detection or after the last one (s)
-DRIVING: Final = 0.1  # least share of the largest speed while driving
-MOST_NOISE: Final = (
-    (0.2, 0.1),
-    (0.2, 0.05),
-)  # largest noise along the ray and across it, at 0 m and per m
-LEAST_CYCLES: Final = 100  # least number of cycles whose typical number of detections tells the sensor's
-USUAL_RANGES: Final = 0.05, 20.0, 120.0  # typical ranges of cones: least, of the likelier unit, most (m)
 FASTEST: Final = 100.0, 8.0  # speed (m/s) and yaw rate (rad/s) that no vehicle exceeds in a tenth of its time
-LARGEST_STEPS: Final = 10.0, 10.0, 5.0  # from the rows around to a row that can be (m/s, m/s, rad/s)
-USUAL: Final = 0.9  # and at most this quantile of the column
-MOST_STEPS: Final = 0.02  # largest share of rows that cannot be
-LINE_RATIO: Final = 0.1  # largest ratio of the spreads of two coordinates of detections on a line
-BOTH_SIDES: Final = 0.15  # largest deviation from 0.5 of the share of a label that is on both sides
 
 
 def parts_of_stamps(log: Log) -> list[Hint]:
-    """Return a hint for each file whose stamps have only whole seconds, or only fractions of a second."""
+    """Hint for each file whose stamps have only whole seconds, or only fractions of a second."""
     found = []
     for file, t in _stamps(log).items():
         falls, seconds, fraction = int((np.diff(t) < 0.0).sum()), "whole seconds", "fraction of each second"
@@ -99,12 +144,12 @@ def parts_of_stamps(log: Log) -> list[Hint]:
 
 
 def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
-    """Return the log with stamps in seconds, and a hint for each file with another unit."""
+    """Log with stamps in seconds, and a hint for each file with another unit."""
     found, sizes = [], dict.fromkeys(_stamps(log), 1.0)
     for file, t in _stamps(log).items():
-        step, (shortest, longest) = _median(np.abs(np.diff(t))), USUAL_STEPS
-        fitting = [size for size in TIME_UNITS if shortest <= step * size <= longest]
-        if step > longest and fitting:
+        step = _median(np.abs(np.diff(t)))
+        fitting = [size for size in TIME_UNITS if 2e-4 <= step * size <= 5.0]
+        if step > 5.0 and fitting:  # rows are usually 0.2 ms to 5 s apart
             size = sizes[file] = fitting[0]
             found.append(hint_of("unit of stamps", file=file, step=step, unit=TIME_UNITS[size], size=size))
     if not found:
@@ -115,13 +160,13 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
 
 
 def with_usual_noise(log: Log) -> Log:
-    """Return the log with at most a usual noise of detections: measured by wrong odometry, it is larger."""
+    """The log with at most a usual noise of detections: measured by wrong odometry, it is larger."""
     noise = log.measured
     if log.detections_stated or noise is None or noise.along is None or noise.across is None:
         return log
     along, across = (
         replace(one, sigma=np.minimum(one.sigma, most))
-        for one, most in zip((noise.along, noise.across), MOST_NOISE, strict=True)
+        for one, most in ((noise.along, (0.2, 0.1)), (noise.across, (0.2, 0.05)))  # at 0 m and per m
     )
     usual = replace(noise, along=along, across=across)
     known = ((cycle, usual.covariances(cycle.points_vehicle, inflated=False)) for cycle in log.cycles)
@@ -129,26 +174,27 @@ def with_usual_noise(log: Log) -> Log:
 
 
 def gaps_and_reach(log: Log) -> list[Hint]:
-    """Return hints if the vehicle drives without detections at an end, or if most cycles have hardly any."""
+    """Hints if the vehicle drives without detections at an end, or if most cycles have hardly any."""
     if not log.cycles:
         return []
-    t, speed, begin, end = log.odometry.t, _speeds(log), log.cycles[0].t, log.cycles[-1].t
-    driven = t[speed > DRIVING * speed.max()]
+    t, speed = log.odometry.t, np.hypot(*log.odometry.twist[:, :2].T)
+    begin, end = log.cycles[0].t, log.cycles[-1].t
+    driven = t[speed > 0.1 * speed.max()]  # else it stands
     early = driven.size and begin - driven[0] > WITHOUT_DETECTIONS
     late = driven.size and driven[-1] - end > WITHOUT_DETECTIONS
     found = [hint_of("detections begin late", seconds=begin - t[0])] if early else []
     found += [hint_of("detections end early", seconds=t[-1] - end)] if late else []
     typical = _median(np.array([len(cycle.labels) for cycle in log.cycles]))
-    few = len(log.cycles) >= LEAST_CYCLES and typical < MIN_MATCHED
+    few = len(log.cycles) >= 100 and typical < MIN_MATCHED
     return found + ([hint_of("few detections", count=typical, least=MIN_MATCHED)] if few else [])
 
 
 def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
-    typical, (least, likely, most) = _median(np.abs(_points(log))), USUAL_RANGES
-    if typical > most:
-        size = next((size for size in LENGTH_UNITS if typical * size <= likely), min(LENGTH_UNITS))
+    typical = _median(np.abs(_points(log)))
+    if typical > 120.0:  # cones are seen at 20 m or less
+        size = next((size for size in LENGTH_UNITS if typical * size <= 20.0), min(LENGTH_UNITS))
         what = f"are in {LENGTH_UNITS[size]}, not in metres"
-    elif 0.0 < typical < least:
+    elif 0.0 < typical < 0.05:
         size, what = 1e3, "were divided by 1000 although they were in metres"
     else:
         return log, []
@@ -158,12 +204,13 @@ def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
 
 
 def possible_rows(log: Log) -> tuple[Log, list[Hint]]:
-    """Return the log without steps of the odometry that cannot be, and a hint about these rows."""
+    """Log without steps of the odometry that cannot be, and a hint about these rows."""
     twist = log.odometry.twist
     smooth = scipy.ndimage.median_filter(twist, size=(5, 1), mode="nearest")
     step = np.abs(twist - smooth)
-    wrong = step > np.maximum(LARGEST_STEPS, np.quantile(np.abs(twist), USUAL, axis=0))
-    if not 0 < wrong.any(axis=1).sum() < MOST_STEPS * len(twist):
+    # a row steps by at most 10 m/s or 5 rad/s, or by the speeds of the drive itself
+    wrong = step > np.maximum((10.0, 10.0, 5.0), np.quantile(np.abs(twist), 0.9, axis=0))
+    if not 0 < wrong.any(axis=1).sum() < 0.02 * len(twist):  # more rows are how this odometry is
         return log, []
     row, count = int((step * wrong).max(axis=1).argmax()), int(wrong.any(axis=1).sum())
     figures = {"count": count, "total": len(twist), "step": step[row].max(), "row": row + 2}
@@ -172,29 +219,30 @@ def possible_rows(log: Log) -> tuple[Log, list[Hint]]:
 
 
 def beyond_any_vehicle(log: Log) -> list[Hint]:
-    speed, rate = (np.quantile(one, 0.9) for one in (_speeds(log), np.abs(log.odometry.twist[:, 2])))
+    vx, vy, wz = log.odometry.twist.T
+    speed, rate = (np.quantile(one, 0.9) for one in (np.hypot(vx, vy), np.abs(wz)))
     found = [hint_of("too fast", speed=speed)] if speed > FASTEST[0] else []
     return found + ([hint_of("turns too fast", rate=rate)] if rate > FASTEST[1] else [])
 
 
 def camera(log: Log) -> list[Hint]:
-    """Return a hint if the detections lie on a line, as with the axes of a camera."""
+    """Hint if the detections lie on a line, as with the axes of a camera."""
     points = _points(log)
     spread = np.array([points.real.std(), points.imag.std()]) if len(points) else np.ones(2)
     least, most = spread.min(), spread.max()
-    in_line = least < LINE_RATIO * most
+    in_line = least < 0.1 * most  # all detections on a line
     return [hint_of("camera", thin="xy"[int(spread.argmin())], least=least, most=most)] if in_line else []
 
 
 def one_label(log: Log) -> list[Hint]:
     share, labels = sided(log), set(np.unique(_labels(log)).tolist())
-    if labels not in ({LEFT}, {RIGHT}) or abs(share - 0.5) > BOTH_SIDES:
+    if labels not in ({LEFT}, {RIGHT}) or abs(share - 0.5) > 0.15:
         return []
     return [hint_of("one label", label=NAMES[labels.pop()], share=100.0 * share)]
 
 
 def sided(log: Log, turn: complex = 1.0, *, mirrored: bool = False) -> float:
-    """Return the share of near labels on their side, once a mirrored frame is turned; 0.5 without labels."""
+    """Share of near labels on their side, once a mirrored frame is turned; 0.5 without labels."""
     points, labels = _points(log), _labels(log)
     near = np.isin(labels, (LEFT, RIGHT)) & (np.abs(points) < _median(np.abs(points)))
     left = ((points.conj() if mirrored else points)[near] * turn).imag > 0.0
@@ -213,10 +261,6 @@ def _labels(log: Log) -> Array:
     return np.concatenate([np.zeros(0, int), *(cycle.labels for cycle in log.cycles)])
 
 
-def _speeds(log: Log) -> Array:
-    return np.asarray(np.hypot(*log.odometry.twist[:, :2].T))
-
-
 def _median(values: Array) -> float:
     return float(np.median(values)) if len(values) else 0.0
 
@@ -228,22 +272,11 @@ RATE_UNITS: Final = {float(np.pi / 180.0): "degrees per second"}
 SAME_FACTOR: Final = 1.2  # largest ratio of a factor and a unit
 FACTOR_TOLD: Final = 1.6  # least factor, or its inverse, that is told if it is no unit
 TINY: Final = 1e-9  # least size of a factor
-LATE_TOLD: Final = 0.2  # least lag that is told (s): less is left to the calibration
 TURN_TOLD: Final = 8.5  # least yaw of the sensor that is told (degrees)
-TURN_SIGMA: Final = 1.0  # largest standard deviation of the yaw (degrees)
-LEVER_TOLD: Final = 1.0  # least lever arm of the sensor that is told (m)
-LEVER_SIGMA: Final = 0.2  # largest relative standard deviation of the lever arm
 FLAT: Final = 0.2  # largest size of a missing rate, by what the cones show
-AT_REST: Final = 0.03  # largest difference of explained shares between no motion and the best fit
-LEAST_MOTIONS: Final = 20  # least number of motions for a regression
-LEAST_PAIRS: Final = 30  # least number of pairs of cycles that can show no motion,
-UNEXPLAINED: Final = 30.0, 0.2  # with at most this share of them that do (%), explained to this degree
+UNEXPLAINED: Final = 30.0, 0.2  # largest share of pairs that show a motion (%), and its explained degree
 WELL_EXPLAINED: Final = 0.5  # least explained share for a small turn and a place, and for another drive
-FAR_LESS: Final = 0.4  # largest share that a fit explains of another drive, by what the cones show
-SIDES_TOLD: Final = 0.015  # least difference between the lags of both sides that is told (s),
-SIDES_CLEAR: Final = 4.0  # and in standard deviations
-SIDES: Final = 2000, 100  # approximate number of cycles of a side in use, and least number of motions,
-SIDES_EXPLAINED: Final = 0.4  # of which at least this share is explained: of points of lines it is 0.3
+SIDES: Final = 2000, 100  # approximate number of cycles of a side in use, and least number of motions
 FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation (degrees) and whether mirrored
     (180, False): ("the sensor's frame has x to the rear and y to the right", "-x", "-y"),
     (-90, False): ("the sensor's frame has x to the right and y ahead", "y", "-x"),
@@ -254,8 +287,8 @@ FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation 
 }
 
 
-def of_kind(log: Log) -> list[Hint]:
-    """Return a hint if detections are of the other kind than the log says, which is cones by default."""
+def kind_hints(log: Log) -> list[Hint]:
+    """Hint if detections are of the other kind than the log says, which is cones by default."""
     stated = log.sensor.kind or "cones"
     found = {True: "line", False: "cones", None: stated}[is_line(log)]
     return [hint_of(f"kind {found}", stated=stated)] if found != stated else []
@@ -266,17 +299,18 @@ Told = dict[Hint, float]  # hints, and how much more of the motions each explain
 
 
 def motion_hints(log: Log) -> list[Hint]:
-    """Return hints by the regression, the strongest first."""
+    """Hints by the regression, the strongest first."""
     motions, told = motions_of(log), Told()
     share = 100.0 * len(motions.rate) / max(motions.tried, 1)
-    few = motions.tried >= LEAST_PAIRS and share < UNEXPLAINED[0]
+    few = motions.tried >= 30 and share < UNEXPLAINED[0]
     unexplained = [hint_of("unexplained", share=share, tried=motions.tried)] if few else []
-    if len(motions.rate) < LEAST_MOTIONS:
+    if len(motions.rate) < 20:
         return beyond_any_vehicle(log) or unexplained
     regression = Regression(log.odometry, motions)
     fit, why = regression.best()
     explained, rest = regression.explained(fit), regression.shares(0.0 * motions.velocity, 0.0 * motions.rate)
-    may_rest = rest.both.mean() > explained.both.mean() - AT_REST
+    # no motion at all explains as much as the best fit
+    may_rest = rest.both.mean() > explained.both.mean() - 0.03
     stated = log.sensor.kind == "line"
     lines, of_log = (
         stated or bool(is_line(one)) for one in (replace(log, odometry=regression.odometry(fit)), log)
@@ -286,14 +320,14 @@ def motion_hints(log: Log) -> list[Hint]:
         return [hint_of("map frame", evidence=at_rest.words)]
     if unexplained and not lines and explained.both.mean() < UNEXPLAINED[1]:
         return unexplained
-    tell(told, why.get("content"), "pose" if fit.content == "pose" else "fixed frame")
+    add_hint(told, why.get("content"), "pose" if fit.content == "pose" else "fixed frame")
     when, before, after, jumping, constant = regression.jump(fit)
     jump = far_better(jumping, np.maximum(explained.both, rest.both))
     if jump and far_better(jumping, constant):
-        tell(told, jump, "clock jumps", seconds=after - before, when=when)
+        add_hint(told, jump, "clock jumps", seconds=after - before, when=when)
     else:
-        late = why.get("lag") if abs(fit.lag) > LATE_TOLD else None
-        tell(told, late, "late" if fit.lag > 0.0 else "early", seconds=abs(fit.lag))
+        late = why.get("lag") if abs(fit.lag) > 0.2 else None  # less (s) is left to the calibration
+        add_hint(told, late, "late" if fit.lag > 0.0 else "early", seconds=abs(fit.lag))
         tell_missing(told, regression, fit)
     if not may_rest and all(hint.cause != "speeds" for hint in told):
         tell_factors(told, regression, fit)
@@ -302,7 +336,7 @@ def motion_hints(log: Log) -> list[Hint]:
     return sorted(told, key=lambda hint: -told[hint]) or beyond_any_vehicle(log)
 
 
-def tell(told: Told, better: Better | None, mistake: str, **figures: Any) -> None:
+def add_hint(told: Told, better: Better | None, mistake: str, **figures: Any) -> None:
     if better is not None:
         told[hint_of(mistake, evidence=better.words, **figures)] = better.gain
 
@@ -317,13 +351,13 @@ def tell_missing(told: Told, regression: Regression, fit: Fit) -> None:
     speeds = {"stated": np.abs(stated_v).mean(), "seen": np.abs(shown_v).mean()}
     backward = regression.shares(np.where((v.conj() * shown_v).real < 0.0, -v, v), w)
     if turn and rates["stated"] < FLAT * rates["seen"]:
-        tell(told, turn, "no yaw rate", **rates)
+        add_hint(told, turn, "no yaw rate", **rates)
     elif way and speeds["stated"] < FLAT * speeds["seen"]:
-        tell(told, way, "no speed", **speeds)
+        add_hint(told, way, "no speed", **speeds)
     elif no_sign := far_better(backward.way, explained.way):
-        tell(told, no_sign, "no sign")
-    elif seen.both.mean() > max(WELL_EXPLAINED, explained.both.mean() / FAR_LESS):
-        tell(told, way or turn, "other drive", which="way" if way else "turns")
+        add_hint(told, no_sign, "no sign")
+    elif seen.both.mean() > max(WELL_EXPLAINED, explained.both.mean() / 0.4):
+        add_hint(told, way or turn, "other drive", which="way" if way else "turns")
 
 
 def tell_factors(told: Told, regression: Regression, fit: Fit) -> None:
@@ -334,17 +368,17 @@ def tell_factors(told: Told, regression: Regression, fit: Fit) -> None:
     speeds, rates = far_better(explained.way, of_speed.way), far_better(explained.turn, of_rate.turn)
     thousandth = {1e-3: "milliseconds"}
     if speeds and rates and unit_of(speed, thousandth) == unit_of(rate, thousandth):
-        tell(told, speeds, "milliseconds")
+        add_hint(told, speeds, "milliseconds")
         return
     for better, mistake, (unit, size) in (
         (speeds, "unit of speeds", unit_of(speed, SPEED_UNITS)),
         (rates, "unit of yaw rate", unit_of(rate, RATE_UNITS)),
     ):
-        tell(told, better if unit else None, mistake, unit=unit, size=size)
+        add_hint(told, better if unit else None, mistake, unit=unit, size=size)
 
 
 def unit_of(size: float, units: Mapping[float, str]) -> tuple[str, float]:
-    """Return name and size of the unit near a size, or of an unknown unit; without a name near 1."""
+    """Name and size of the unit near a size, or of an unknown unit; without a name near 1."""
     near = min(units, key=lambda one: abs(np.log(one / max(size, TINY))))
     if 1.0 / SAME_FACTOR < size / near < SAME_FACTOR:
         return units[near], near
@@ -358,34 +392,36 @@ def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log) -> None:
     turn = float(np.angle(fit.gain, deg=True)) * (1.0 if mirror else -1.0)
     better = far_better(explained.way, regression.explained(replace(fit, gain=complex(size))).way)
     clear, sure = explained.both.mean() > WELL_EXPLAINED, Better(0.0, "")
-    small = sure if clear and np.rad2deg(fit.sigmas[0] / size) < TURN_SIGMA else None
+    # a small turn is told where it is known to a degree
+    small = sure if clear and np.rad2deg(fit.sigmas[0] / size) < 1.0 else None
     quarter = (90 * round(turn / 90.0) + 179) % 360 - 179
     is_quarter = abs((turn - quarter + 180.0) % 360.0 - 180.0) < TURN_TOLD
     vx, vy = np.median(log.odometry.twist[:, :2], axis=0)
     of_axes = None
     if is_quarter and abs(quarter) == 90 and abs(vy) > abs(vx):
-        tell(told, better, "swapped")
+        add_hint(told, better, "swapped")
     elif is_quarter and quarter == 180 and not mirror and vx < 0.0 and np.median(_points(log).real) > 0.0:
-        tell(told, better, "backward")
+        add_hint(told, better, "backward")
     elif is_quarter and quarter:
         of_axes, (what, x, y) = better, FRAMES[quarter, bool(mirror)]
-        tell(told, better, "frame", what=what, x=x, y=y)
+        add_hint(told, better, "frame", what=what, x=x, y=y)
     elif abs(turn) > TURN_TOLD:
         angle = f"{abs(turn):.1f} degrees to the {'left' if turn > 0.0 else 'right'}"
         side, of_axes = ", with y to the right" if mirror else "", better or small
-        tell(told, of_axes, "turned", angle=angle, side=side, yaw=np.deg2rad(turn))
+        add_hint(told, of_axes, "turned", angle=angle, side=side, yaw=np.deg2rad(turn))
     if mirror and not of_axes:
         back = np.exp(1j * np.deg2rad(turn))
         of_detections = sided(log, back, mirrored=True) >= sided(log, np.conj(back))
-        tell(told, mirror, "y to the right" if of_detections else "yaw rate to the right")
-    if clear and abs(fit.lever) > max(LEVER_TOLD, fit.sigmas[1] / LEVER_SIGMA):
+        add_hint(told, mirror, "y to the right" if of_detections else "yaw rate to the right")
+    # a lever of a metre, known to a fifth
+    if clear and abs(fit.lever) > max(1.0, fit.sigmas[1] / 0.2):
         place = fit.lever * np.conj(fit.gain) / size
         ahead, left = place.real, -place.imag if mirror else place.imag
-        tell(told, sure, "place", ahead=ahead, left=left, along=f"{ahead:+.2f}", aside=f"{left:+.2f}")
+        add_hint(told, sure, "place", ahead=ahead, left=left, along=f"{ahead:+.2f}", aside=f"{left:+.2f}")
 
 
 def side_hints(log: Log) -> list[Hint]:
-    """Return a hint if the motions that cones on the left and on the right show disagree in time.
+    """Hint if the motions that cones on the left and on the right show disagree in time.
 
     The sides are those of the vehicle, as of two cameras; in a bend a left cone may be on the right.
     """
@@ -398,14 +434,161 @@ def side_hints(log: Log) -> list[Hint]:
         regression = Regression(log.odometry, motions)
         fit = regression.fit("twist", 0.0)
         lag, sigma = regression.lag(fit)
-        if regression.explained(replace(fit, lag=lag)).both.mean() < SIDES_EXPLAINED:
+        if regression.explained(replace(fit, lag=lag)).both.mean() < 0.4:  # of points of lines it is 0.3
             return []
         lags.append((lag, sigma))
     apart, sigma = lags[0][0] - lags[1][0], hypot(lags[0][1], lags[1][1])
-    if abs(apart) < max(SIDES_TOLD, SIDES_CLEAR * sigma):
+    if abs(apart) < max(0.015, 4.0 * sigma):
         return []
     late, early = ("left", "right") if apart > 0.0 else ("right", "left")
     return [hint_of("sides", late=late, early=early, ms=1e3 * abs(apart))]
+
+
+# --- noise that is stated ------------------------------------------------------------------------------
+
+NOISE_FACTOR: Final = 1.5  # least ratio of measured and stated noise of the odometry for a hint
+SCATTER_FACTOR: Final = 2.0  # least ratio of measured and stated noise of detections for a hint
+UNIT_FACTOR: Final = 10.0  # least ratio that tells another unit
+
+
+def _odometry_hints(log: Log) -> list[Hint]:
+    """Compare white noise: orders of differences that disagree contain motion as well."""
+    twists = TwistRecord()
+    twists.add(log.odometry)
+    orders, white = twists.orders(), twists.white()
+    if orders is None or white is None:
+        return []
+    (least, interval), stated, hints = white, log.odometry_sigma, []
+    agree = orders.max(axis=0) < 1.2 * least
+    most = np.hypot(least, np.array(ASSUMED_DRIFT) / np.sqrt(interval))
+    for which, values, size in (
+        (agree & (least > NOISE_FACTOR * stated), least, "small"),
+        (NOISE_FACTOR * most < stated, most, "large, unless it stands for errors that change slowly"),
+    ):
+        figures = [
+            f"{name} scatters by {value:.2g} {TWIST[name]}, and {said:.2g} is stated"
+            for name, value, said, chosen in zip(TWIST, values, stated, which, strict=True)
+            if chosen
+        ]
+        if figures:
+            hints.append(hint_of("noise of odometry", figures=", ".join(figures), size=size))
+    return hints
+
+
+def _detection_hints(log: Log) -> list[Hint]:
+    """Compare standard deviations along the ray or across it, whichever is farther off.
+
+    The size of a cone is the least noise; tracking with a gate limits the largest measurable noise.
+    """
+    cycles, found = log.cycles[:300], dict[float, Hint]()
+    measured = measure_log(replace(log, cycles=cycles))
+    if measured is None or measured.along is None or measured.across is None:
+        return []
+    points = np.concatenate([cycle.points_vehicle for cycle in cycles])
+    stated = ray_sigmas(points, np.concatenate([cycle.covariances for cycle in cycles]))
+    near = (ranges := np.hypot(*points.T)) < FOLLOW_RANGE
+    ranges, stated, at = ranges[near], stated[near], float(np.median(ranges[near]))
+    gate = np.minimum(GATE_UNKNOWN[0] + GATE_UNKNOWN[1] * ranges, GATE_UNKNOWN[2])
+    floors = np.full(len(ranges), LEAST_NOISE[0]), LEAST_NOISE[1] * ranges
+    rays = ("along", measured.along), ("across", measured.across)
+    for (way, ray), claimed, floor in zip(rays, stated.T, floors, strict=True):
+        sigmas, scatter = ray.sigmas(ranges), float(ray.sigmas(np.array([at]))[0])
+        small = (sigmas > SCATTER_FACTOR * np.maximum(claimed, floor)).mean()
+        large = ((SCATTER_FACTOR * sigmas < claimed) & (3.0 * sigmas < gate)).mean()
+        if max(small, large) > 0.75:
+            ratio = float(np.median(claimed / sigmas))
+            is_unit = not 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR
+            how = f"too {'small' if small > large else 'large'}"
+            how += ", as in another unit, or there are none at all" if is_unit else ""
+            figures = {
+                "scatter": scatter,
+                "at": at,
+                "stated": scatter * ratio,
+                "way": way,
+                "how": how,
+            }
+            cause = "covariances" if is_unit else "noise"
+            found[max(small, large)] = hint_of("noise of detections", cause=cause, **figures)
+    return [found[max(found)]] if found else []
+
+
+# --- cones, or points of lines -------------------------------------------------------------------------
+
+COMPARED: Final = 2  # nearest detections of a side that are compared: noise grows with the range
+MOVED: Final = 0.25  # least way between both cycles, over the gap: at rest a line is seen at the same places
+LONGEST: Final = 1.5  # longest time between them (s), over which odometry hardly drifts
+FEWEST: Final = 80  # comparisons that tell: the median of a line has a sigma of 0.08
+CONES: Final = 0.32  # median distance over half the gap up to which they are cones
+LINE: Final = 0.4  # from which on they are points of a line; between, it cannot be told
+
+
+@lru_cache(maxsize=2)
+def is_line(log: Log) -> bool | None:
+    """Whether the detections of the first seconds of a log are points of lines; None if that is not clear.
+
+    The nearest detections of each side are laid on those of an earlier cycle by odometry. Cones find
+    themselves there, within their noise. Points of a line find a neighbour: at distances that are spread
+    evenly over half the gap between points, whatever the gap.
+    """
+    cycles = [cycle for cycle in log.cycles if cycle.t <= log.cycles[0].t + 120.0]
+    poses = dead_reckoned(log.odometry, np.array([cycle.t for cycle in cycles]))
+    away, across = list[float](), list[float]()  # from partners, over half the gap; from their line (sigmas)
+    for side, label in enumerate(BOUNDARIES):
+        seen = list[tuple[float, Array, Array, Array]]()
+        for cycle, pose in zip(cycles, poses, strict=True):
+            own = cycle.labels  # or the vehicle's side, where no detection has a label
+            if (own == UNKNOWN).all():
+                own = np.where(cycle.points_vehicle[:, 1] > 0.0, LEFT, RIGHT)
+            points, sigmas = _nearest_of_side(cycle.where(own == label))
+            if len(points) > 1:
+                seen.append((cycle.t, pose, points, sigmas))
+        if not seen:
+            continue
+        gaps = (np.asarray(KDTree(points).query(points[:COMPARED], k=2)[0]) for _, _, points, _ in seen)
+        gap = float(np.median([np.median(apart[:, 1]) for apart in gaps]))
+        for k, (t, pose, points, sigmas) in enumerate(seen):
+            begin = int(np.searchsorted([one[0] for one in seen[:k]], t - LONGEST))
+            for _, earlier, partners, _ in reversed(seen[begin:k]):
+                way = relative(earlier, pose)
+                if np.hypot(way[0], way[1]) < MOVED * gap:
+                    continue
+                placed = move_points(way, points[:COMPARED])
+                found = np.hypot(*placed.T) < np.hypot(*partners[-1])
+                apart = KDTree(partners).query(placed[found])[0]
+                away += np.minimum(apart / (0.5 * gap), 1.5).tolist()
+                sigma = np.maximum(2.0**0.5 * sigmas[:COMPARED][found], 1e-3)
+                across += (_from_line(placed[found], partners) / sigma).tolist()
+                break
+            # comparisons that are enough: 0.1 to 0.27 was met for cones, 0.46 to 1.2 for lines
+            if len(away) >= (side + 1) * 300 // 2:
+                break
+    if len(away) < FEWEST:
+        return None
+    if np.median(away) < CONES:
+        return False
+    # what is farther from the line than 2.2 sigmas is garbled
+    return True if np.median(away) > LINE and np.median(across) < 2.2 else None
+
+
+def _nearest_of_side(detections: Detections) -> tuple[Array, Array]:
+    """Nearest points (k, 2), one per cone, and the standard deviation (k,) of a coordinate (m)."""
+    points, covariances = detections.points_vehicle, detections.covariances
+    variances, chosen = 0.5 * np.trace(covariances, axis1=1, axis2=2), list[int]()
+    for k in np.argsort(np.hypot(*points.T)).tolist():
+        apart = ((points[chosen] - points[k]) ** 2).sum(axis=1)
+        if (apart > 3.0**2 * (variances[chosen] + variances[k])).all():
+            chosen.append(k)
+        if len(chosen) == 10:
+            break
+    return points[chosen], np.sqrt(variances[chosen])
+
+
+def _from_line(points: Array, corners: Array) -> Array:
+    """Distances (m,) of each point (m, 2) from the line through corners (k, 2), at least two."""
+    begin, step = corners[:-1], np.diff(corners, axis=0)
+    off = points[:, None] - begin
+    share = np.clip((off * step).sum(axis=2) / (step**2).sum(axis=1), 0.0, 1.0)
+    return np.asarray(np.hypot(*(off - share[..., None] * step).transpose(2, 0, 1)).min(axis=1))
 
 
 # --- logs that are refused, and words of labels ----------------------------------------------------------
@@ -413,7 +596,6 @@ def side_hints(log: Log) -> list[Hint]:
 NO_LABEL_WORDS: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
 # causes of a refusal, by the size of numbers; labels and frames are never the cause
 REFUSABLE: Final = {"stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances"}
-SHOWN_WORDS: Final = 3  # largest number of foreign labels in a hint
 
 
 def read_usable_log(folder: Path, limits: LimitSettings, scale: float | None = None) -> Log:
@@ -446,7 +628,7 @@ def read_plausible_log(
 
 
 def refused_hints(folder: Path) -> list[Hint]:
-    """Return the hints about a refused log; none if it cannot be parsed."""
+    """Hints about a refused log; none if it cannot be parsed."""
     try:
         files = ODOMETRY_FILE, DETECTIONS_FILE
         rows, table = (read_table(folder / file, logs.COLUMNS[file]) for file in files)
@@ -464,5 +646,5 @@ def _foreign_label_hints(folder: Path, log: Log) -> list[Hint]:
         return []
     met = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"])
     foreign = [word for word, _ in met.most_common() if word.strip().lower() not in NO_LABEL_WORDS]
-    words = ", ".join(map(shown, foreign[:SHOWN_WORDS]))
+    words = ", ".join(map(shown, foreign[:3]))
     return [hint_of("foreign labels", words=words)] if foreign else []

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.factors.se2 import relative
 from pathspace_graph.front_end.scan_matching import (
     FARTHEST,
@@ -37,10 +36,7 @@ Complex = NDArray[np.complex128]
 # --- motion by the cones ---------------------------------------------------------------------------------
 
 MOST_CYCLES: Final = 1000  # approximate number of cycles in use, in bursts of successive ones
-BURST: Final = 12
 GAPS: Final = (1, 2, 4)  # steps in cycles between the two of a pair
-LONGEST_PAIR: Final = 0.55  # longest time between the two of a pair (s), unless cycles are rarer
-MOST_COMPARED: Final = 16  # number of detections of a cycle in use, the nearest ones
 REACHES: Final = (1.5, 1.2, 0.9, 0.7, 0.5, 0.4, 0.4)  # reach of each step of a registration (m)
 LIMITS: Final = (FARTHEST, 0.5, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED, LEAST_SHARE)  # 0.5: least sum of weights
 SIGMA: Final = 0.15  # standard deviation of a coordinate (m), as the stated one may be wrong
@@ -51,11 +47,7 @@ FURTHER: Final = [
     for angle in np.arange(0.0, 2.0 * pi, APART / ring)
 ]
 DISTANCES: Final = [float(np.hypot(*start[:2])) for start in FURTHER]
-FASTEST_START: Final = 30.0  # largest speed of these (m/s), beyond the first ring
 MATCHED: Final = 0.4  # least share of matched detections of a motion
-WELL_MATCHED: Final = 0.75  # share from which no further start is tried
-BETTER_MATCHED: Final = 0.1  # by how much more a later start must match
-WORST_CONDITION: Final = 1e8  # largest condition number of the information about a motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,59 +63,67 @@ class Motions:
 
 
 def motions_of(
-    log: Log, most: int = MOST_CYCLES, fewest: int = MIN_DOUBTING, fastest: float = FASTEST_START
+    log: Log, most: int = MOST_CYCLES, fewest: int = MIN_DOUBTING, fastest: float = 30.0
 ) -> Motions:
-    """Register nearby cycles to each other; the odometry gives only the first of several starts."""
+    """Register nearby cycles to each other; the odometry gives only the first of several starts.
+
+    Further starts are tried up to a speed `fastest` (m/s).
+    """
     cycles = [_nearest(cycle) for cycle in log.cycles if len(cycle.labels) >= fewest]
-    stamps, odometry = np.array([cycle.t for cycle in cycles]), log.odometry
-    stated = np.vstack([np.zeros((1, 3)), integrate_poses(np.diff(odometry.t), odometry.twist[:-1])])
-    poses = np.column_stack([np.interp(stamps, odometry.t, column) for column in stated.T])
-    longest = max(LONGEST_PAIR, 1.5 * float(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0.0
+    stamps = np.array([cycle.t for cycle in cycles])
+    poses = dead_reckoned(log.odometry, stamps)
+    # the two of a pair are at most half a second apart, unless cycles are rarer
+    longest = max(0.55, 1.5 * float(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0.0
     every, rows, tried = ceil(len(cycles) / most), list[Any](), 0
     for gap in GAPS:
         twist = np.zeros(3)
         for k in range(len(cycles) - gap):
             dt = float(stamps[k + gap] - stamps[k])
-            if (k // BURST) % every or not 0.0 < dt <= longest:
+            if (k // 12) % every or not 0.0 < dt <= longest:
                 continue
             starts = [relative(poses[k], poses[k + gap]), dt * twist, np.zeros(3)]
             share, motion, information = register(cycles[k], cycles[k + gap], starts, fastest * dt, fewest)
             tried += 1
-            if share > MATCHED and np.linalg.cond(information) < WORST_CONDITION:
-                twist = twist_of(motion, dt)
+            if share > MATCHED and np.linalg.cond(information) < 1e8:
+                twist = mean_twist(motion, dt)
                 rows.append([stamps[k], stamps[k + gap], *twist, *(np.linalg.inv(information) / dt**2).flat])
     table = np.array(sorted(rows, key=lambda row: row[0] + row[1])).reshape(-1, 14)
     begin, end, vx, vy, rate = table[:, :5].T
     return Motions(begin, end, vx + 1j * vy, rate, table[:, 5:].reshape(-1, 3, 3), tried)
 
 
+def dead_reckoned(odometry: Odometry, stamps: Array) -> Array:
+    """Poses (n, 3) at stamps (n,) in s, by the odometry alone."""
+    return np.column_stack([np.interp(stamps, odometry.t, column) for column in odometry.poses().T])
+
+
 def _nearest(cycle: Detections) -> Detections:
     ranges = np.hypot(*cycle.points_vehicle.T)
-    return cycle.where(ranges <= np.sort(ranges)[:MOST_COMPARED].max(initial=0.0))
+    return cycle.where(ranges <= np.sort(ranges)[:16].max(initial=0.0))
 
 
 def register(
     before: Detections, after: Detections, starts: Sequence[Array], farthest: float, fewest: int
 ) -> tuple[float, Array, Array]:
-    """Return the share of matched detections, the motion (3,) and its information (3, 3) by the best start.
+    """Share of matched detections, the motion (3,) and its information (3, 3) by the best start.
 
     Where these starts match too little, further ones are tried, up to a distance (m).
     """
     best, variances = (0.0, np.zeros(3), np.zeros((3, 3))), np.full(len(after.labels), SIGMA**2)
     for k, start in enumerate([*starts, *FURTHER[: np.searchsorted(DISTANCES, farthest)]]):
-        if best[0] > (WELL_MATCHED if k < len(starts) else MATCHED):
+        if best[0] > (0.75 if k < len(starts) else MATCHED):
             break
         motion, information, matched, _ = kernels.matched(
             before.points_vehicle, after.points_vehicle, variances, start, REACHES, LIMITS
         )
         share = float(matched.sum()) / min(len(before.labels), len(after.labels))
-        if matched.sum() >= fewest and share > best[0] + BETTER_MATCHED * (best[0] > 0.0):
+        if matched.sum() >= fewest and share > best[0] + 0.1 * (best[0] > 0.0):
             best = share, motion, information
     return best
 
 
-def twist_of(motion: Array, dt: float) -> Array:
-    """Return the constant twist (3,) of a motion (3,) in a time dt (s)."""
+def mean_twist(motion: Array, dt: float) -> Array:
+    """Constant twist (3,) of a motion (3,) in a time dt (s)."""
     turn = motion[2]
     way = (motion[0] + 1j * motion[1]) * np.exp(-0.5j * turn) / np.sinc(turn / (2.0 * pi))
     return np.array([way.real, way.imag, turn]) / dt
@@ -134,20 +134,11 @@ def twist_of(motion: Array, dt: float) -> Array:
 Content = Literal["twist", "fixed", "pose"]
 CONTENTS: Final[tuple[Content, ...]] = ("twist", "fixed", "pose")
 LAGS: Final[list[float]] = np.arange(-10.0, 10.01, 0.25).tolist()  # candidate lags (s)
-NEAR: Final[list[float]] = np.linspace(-0.25, 0.25, 11).tolist()  # from a candidate to finer ones (s)
-LATE_WORTH: Final = 0.002  # explained share by which a lag must be better for each second
 FLOORS: Final = np.array([0.3, 0.3, 0.05])  # added to the standard deviations of a motion (m/s, m/s, rad/s)
-FLOOR_SHARE: Final = 0.08  # and this share of its size
-MOST_GAIN: Final = 5.0  # least gain that makes the speeds of a fixed frame mere noise
 WIDE: Final = 2.0  # sigmas at which a motion counts as explained by `exp(-1/2)`
 STEPS: Final = 6  # steps of reweighting
 LAG_STEP: Final = 0.05  # half the difference that approximates a derivative by the lag (s)
-DEPENDENT: Final = 12  # number of successive motions whose errors may depend on each other
 AROUND: Final = 9  # number of motions in a median
-TELLING: Final = 0.2  # difference of explained shares from which a motion discriminates two readings
-BY_CHANCE: Final = 1e-10  # largest p-value of a better reading (sign test)
-FAR_BETTER: Final = 1.8  # least ratio of its explained share to that of the other
-LEAST_EXPLAINED: Final = 0.3  # least explained share of a better reading
 
 
 @dataclass(frozen=True)
@@ -182,12 +173,13 @@ class Better(NamedTuple):
 def far_better(one: Array, other: Array) -> Better | None:
     """Compare explained shares (P,) where they differ; None unless `one` is clearly better."""
     difference = one - other
-    telling = np.abs(difference) > TELLING
+    telling = np.abs(difference) > 0.2
     if not telling.any():
         return None
     share, less = float(one[telling].mean()), float(other[telling].mean())
     chance = float(scipy.special.bdtrc(int((difference[telling] > 0.0).sum()) - 1, int(telling.sum()), 0.5))
-    if chance > BY_CHANCE or share < max(FAR_BETTER * less, LEAST_EXPLAINED):
+    # by a sign test it is no chance, and it explains much more, and enough
+    if chance > 1e-10 or share < max(1.8 * less, 0.3):
         return None
     words = f"{100.0 * less:.0f} % of the cones' motions, {100.0 * share:.0f} % with the likely cause"
     return Better(float(difference.sum()), f"the odometry explains {words}")
@@ -205,13 +197,11 @@ class Regression:
         )
         self._sums = {"twist": (way, turn), "fixed": (path, turn), "pose": (v, np.unwrap(w, period=period))}
         sizes = np.abs([motions.velocity, motions.velocity, motions.rate]).T
-        self._variance = variance = motions.covariance + np.square(FLOORS + FLOOR_SHARE * sizes)[
-            :, None
-        ] * np.eye(3)
+        self._variance = variance = motions.covariance + np.square(FLOORS + 0.08 * sizes)[:, None] * np.eye(3)
         self._information, self._of_way = np.linalg.inv(variance), np.linalg.inv(variance[:, :2, :2])
 
     def stated(self, content: Content, lag: float) -> tuple[Complex, Array]:
-        """Return the mean velocities and yaw rates (P,) that the odometry states for the motions."""
+        """Mean velocities and yaw rates (P,) that the odometry states for the motions."""
         begin, end = self.motions.begin - lag, self.motions.end - lag
         way, turn = (
             (np.interp(end, self._t, one) - np.interp(begin, self._t, one)) / (end - begin)
@@ -224,7 +214,7 @@ class Regression:
         return fit.gain * v + 1j * fit.lever * fit.rate * w, fit.rate * w
 
     def odometry(self, fit: Fit) -> Odometry:
-        """Return the odometry that a fit takes for that of the sensor."""
+        """Odometry that a fit takes for that of the sensor."""
         way, turn = (np.gradient(one, self._t) for one in self._sums[fit.content])
         v = fit.gain * (np.abs(way) if fit.content == "pose" else way)
         return Odometry(self._t + fit.lag, np.column_stack([v.real, v.imag, fit.rate * turn]))
@@ -233,7 +223,7 @@ class Regression:
         return self.shares(*self.predicted(fit))
 
     def shares(self, v: Complex, w: Array) -> Shares:
-        """Return the degrees to which velocities and yaw rates (P,) explain the motions."""
+        """Degrees to which velocities and yaw rates (P,) explain the motions."""
         off = self._off(v, w)
         way = np.einsum("pi,pij,pj->p", off[:, :2], self._of_way, off[:, :2])
         both = np.einsum("pi,pij,pj->p", off, self._information, off)
@@ -270,17 +260,18 @@ class Regression:
         return factors, np.sqrt(np.abs(np.diag(inverse @ (scores.T @ scores.conj()) @ inverse)))
 
     def best(self) -> tuple[Fit, dict[str, Better]]:
-        """Return the simplest fit that no other explains far more than, with a refined lag.
+        """Simplest fit that no other explains far more than, with a refined lag.
 
         It comes with the reasons why its `content` and its `lag` are not those of a good log.
         """
         fits = {(content, lag): self.fit(content, lag) for content in CONTENTS for lag in LAGS}
         shares = {key: self.explained(fit).both for key, fit in fits.items()}
-        worth = {key: float(share.mean()) - LATE_WORTH * abs(key[1]) for key, share in shares.items()}
+        worth = {key: float(share.mean()) - 0.002 * abs(key[1]) for key, share in shares.items()}
         latest = {content: max(LAGS, key=lambda lag: worth[content, lag]) for content in CONTENTS}
         best: tuple[Content, float] = "twist", 0.0
         for one in ((content, lag) for content in CONTENTS for lag in (0.0, latest[content])):
-            possible = one[0] == "twist" or abs(fits[one].gain) < MOST_GAIN
+            # a gain of 5 makes the speeds of a fixed frame of mere noise
+            possible = one[0] == "twist" or abs(fits[one].gain) < 5.0
             best = one if possible and far_better(shares[one], shares[best]) else best
         why = {
             "content": far_better(shares[best], shares["twist", latest["twist"]]),
@@ -291,7 +282,7 @@ class Regression:
         return fit, {name: better for name, better in why.items() if better}
 
     def lag(self, fit: Fit) -> tuple[float, float]:
-        """Return how much later than by a fit the stamps of the detections are (s), and its sigma."""
+        """How much later than by a fit the stamps of the detections are (s), and its sigma."""
         total, information = 0.0, self._information
         for _ in range(STEPS):
             lags = fit.lag + total + LAG_STEP * np.array([-1.0, 0.0, 1.0])
@@ -304,7 +295,7 @@ class Regression:
         return total, float(np.linalg.norm(in_blocks(scores))) / curvature
 
     def jump(self, fit: Fit) -> tuple[float, float, float, Array, Array]:
-        """Return when the lag jumps, the lags before and after (s), and the shares (P,) that are explained.
+        """When the lag jumps, the lags before and after (s), and the shares (P,) that are explained.
 
         The last shares are those by one of both lags alone, the better one.
         """
@@ -318,11 +309,13 @@ class Regression:
             when, before, after = float(self.motions.end[k]), lags[first], lags[second]
             jumping = np.append(shares[first, : k + 1], shares[second, k + 1 :])
             constant = shares[max(first, second, key=lambda lag: sums[lag, -1])]
-            lags = sorted({lag + off for lag in (before, after) for off in NEAR})
+            lags = sorted(
+                {lag + off for lag in (before, after) for off in np.linspace(-0.25, 0.25, 11).tolist()}
+            )
         return when, before, after, jumping, constant
 
     def around(self) -> tuple[Complex, Array]:
-        """Return medians (P,) of successive motions, which explain what the cones show."""
+        """Medians (P,) of successive motions, which explain what the cones show."""
         v = self.motions.velocity
         columns = np.column_stack([v.real, v.imag, self.motions.rate])
         vx, vy, rate = scipy.ndimage.median_filter(columns, size=(AROUND, 1), mode="nearest").T
@@ -330,5 +323,5 @@ class Regression:
 
 
 def in_blocks(scores: NDArray[Any]) -> NDArray[Any]:
-    """Add up rows (P, ...) of successive motions, which share cycles."""
-    return np.asarray(np.add.reduceat(scores, np.arange(0, len(scores), DEPENDENT)))
+    """Add up rows (P, ...) of a dozen successive motions, which share cycles."""
+    return np.asarray(np.add.reduceat(scores, np.arange(0, len(scores), 12)))

@@ -7,8 +7,9 @@ need ROS; docs/ros2.md has the topics, parameters, frames and QoS.
 """
 
 import sys
-from collections import deque
-from collections.abc import Callable, Sequence
+from bisect import insort
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import count
@@ -18,21 +19,20 @@ from typing import Any, Final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.convert.messages import BROKEN, frame_of, pose_of, stamp_of
-from pathspace_graph.convert.recording import ASSUMED
-from pathspace_graph.convert.settings import Frames
+from pathspace_graph.convert import messages
+from pathspace_graph.convert.lines import along_lines, default_spacing
+from pathspace_graph.convert.recording import ASSUMED, beyond_limits, distinct, in_vehicle_frame, usable
+from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings
 from pathspace_graph.errors import PathspaceError, SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.se2 import compose, inverse, se2_exp
 from pathspace_graph.io.files import write_json
-from pathspace_graph.io.log import SIGMA_ODOMETRY
+from pathspace_graph.io.log import SIGMA_ODOMETRY, Detections, Odometry
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, map_to_json, read_map
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult
-
-from .stream import MessageStream
 
 STEP: Final = 1.0  # distance of the published points of a boundary (m)
 AHEAD: Final = 20.0  # distance up to which the road ahead is published (m)
@@ -40,9 +40,77 @@ CENTRE: Final = 2  # identifier of the centre line among the lines
 COLOURS: Final = {LEFT: (0.0, 0.2, 1.0), RIGHT: (1.0, 0.9, 0.0), CENTRE: (1.0, 1.0, 1.0)}  # red, green, blue
 LINE_STRIP: Final = 4  # type of a `Marker` that is a line
 MOST_POSES: Final = 1000  # number of poses of the published path, by default
-MOST_ODOMETRY: Final = 500  # number of poses of the odometry that are remembered for a cycle
 BODY: Final = "base_link"  # frame of a vehicle whose odometry names none
 TRANSFORMS: Final = "/tf"
+
+
+class MessageStream:
+    """Buffer of messages, which gives cycles in order, each with its twists; refused ones are counted.
+
+    A cycle waits for older ones until a message is newer by `wait` (s), since estimators refuse late ones.
+    """
+
+    def __init__(self, frames: Frames | None = None, wait: float = 0.0) -> None:
+        self.frames, self.noise, self.rule = frames or Frames(), NoiseSettings(), LabelRule()
+        self.refused: Counter[str] = Counter()  # number of messages for each reason
+        self._twists: deque[tuple[float, list[float]]] = deque(maxlen=10_000)
+        self._first = np.inf  # the stamp (s) of the first twist
+        self._wait = wait
+        self._waiting = list[Detections]()  # in order of their stamps
+        self._newest = -np.inf  # the stamp (s) of the newest message with detections
+
+    @property
+    def newest_twist(self) -> Array:
+        """The newest twist (3,) in m/s, m/s and rad/s."""
+        return np.array(self._twists[-1][1])
+
+    def take_odometry(self, message: Any, received: float) -> bool:
+        """Buffer the twist of a message that was received at this time (s); return whether it is usable."""
+        try:
+            t, twist = messages.stamp_of(message) or received, messages.twist_of(message)
+            if twist is None:
+                raise ValueError("odometry: expected a message with a twist, found a pose alone")
+            twist = twist * self.frames.flip
+            if not np.isfinite([t, *twist]).all() or (self._twists and t <= self._twists[-1][0]):
+                raise ValueError("odometry: expected finite numbers and a stamp later than the one before")
+            if beyond_limits(twist).any():  # an estimator would refuse each cycle that holds it
+                raise ValueError("odometry: expected a speed and a yaw rate that a vehicle can have")
+            self._twists.append((t, twist.tolist()))
+            self._first = min(self._first, t)
+        except messages.BROKEN as error:
+            self.refused[str(error)] += 1
+            return False
+        return True
+
+    def take_detections(self, message: Any, received: float) -> Iterator[tuple[Odometry, Detections]]:
+        """Yield the cycles that have waited for long enough, with the twists since the last in `use`."""
+        try:
+            points = messages.points_of(message, self.rule)
+            points = points.where(points.lines < 0)  # polylines beside cones are decoration
+            if (points.lines == messages.DENSE).any():
+                points = usable(points, self.refused)
+                points = along_lines(points, default_spacing(points))
+            else:
+                points = distinct(points, self.refused)
+            t = messages.stamp_of(message) or received
+            if not self._first <= t < np.inf:
+                raise ValueError("detections: expected a stamp not before that of the first odometry")
+            cycle = in_vehicle_frame(t, points, self.frames, self.noise, self.refused)
+        except messages.BROKEN as error:
+            self.refused[str(error)] += 1
+            return
+        self._newest = max(self._newest, t)
+        insort(self._waiting, cycle, key=lambda one: one.t)
+        while self._waiting and self._waiting[0].t <= self._newest - self._wait:
+            cycle = self._waiting.pop(0)
+            rows = [row for row in self._twists if row[0] <= cycle.t]
+            twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
+            yield Odometry(np.array([stamp for stamp, _ in rows]), twists), cycle
+
+    def use(self, t: float) -> None:
+        """Drop the twists that a cycle at t (s) has used, except the last one, which is held."""
+        while len(self._twists) > 1 and self._twists[1][0] <= t:
+            self._twists.popleft()
 
 
 class Bridge:
@@ -68,17 +136,17 @@ class Bridge:
         self.frame, self.body = "", BODY  # frames of the odometry's pose and of the vehicle
         self._known = read_map(known) if known else None
         self._sigma = np.array(sigma, float)
-        self._odometry = deque[tuple[float, Array, Array]](maxlen=MOST_ODOMETRY)  # stamp, pose and twist
+        self._odometry = deque[tuple[float, Array, Array]](maxlen=500)  # stamp, pose and twist
 
     def take_odometry(self, message: Any, received: float) -> None:
         """Take a message with odometry, received at a time (s)."""
         if not self.stream.take_odometry(message, received):
             return
-        with suppress(*BROKEN):
-            pose, t = pose_of(message), stamp_of(message) or received
-            self.body = frame_of(message, "child_frame_id") or self.body
+        with suppress(*messages.BROKEN):
+            pose, t = messages.pose_of(message), messages.stamp_of(message) or received
+            self.body = messages.frame_id_of(message, "child_frame_id") or self.body
             if pose is not None and np.isfinite(pose).all():
-                self.frame = frame_of(message)
+                self.frame = messages.frame_id_of(message)
                 self._odometry.append((t, pose, self.stream.newest_twist))
 
     def update(self, message: Any, received: float) -> CycleResult | None:
@@ -133,7 +201,7 @@ class Bridge:
         return made.absolute()
 
 
-def boundary_points(track: Map) -> dict[int, Array]:
+def curve_points(track: Map) -> dict[int, Array]:
     """Sample points (n, 2) along each boundary, in m, map frame."""
     points = {}
     for label, boundary in track.boundaries.items():
@@ -187,7 +255,7 @@ def publisher(
         seconds, nanoseconds = divmod(round(result.t * 1e9), 10**9)
         stamp = Time(sec=seconds, nanosec=nanoseconds)
         header, ahead = Header(frame_id="map", stamp=stamp), bridge.mapper.ahead(AHEAD)
-        to_map.publish(lines(boundary_points(bridge.mapper.outline()), header))
+        to_map.publish(lines(curve_points(bridge.mapper.outline()), header))
         near = {LEFT: ahead.left, RIGHT: ahead.right, CENTRE: ahead.points}
         to_ahead.publish(lines(near, Header(frame_id=bridge.body, stamp=stamp)))
         at = PoseStamped(header=header)

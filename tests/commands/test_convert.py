@@ -105,7 +105,10 @@ def test_hints_at_units_name_the_option(
     text = "\n".join([header, *(",".join(f"{value:.9g}" for value in row) for row in table), ""])
     (folder / "odometry.csv").write_text(text)
     run("convert", folder, *OPTIONS, "--out", tmp_path / "log")
-    assert "(--units speed=km/h)" in capsys.readouterr().err
+    assert (
+        "the speeds are in km/h, not in m/s; multiply vx and vy by 0.27778, or convert with --units"
+        in capsys.readouterr().err
+    )
 
 
 def test_times_of_a_run_count_from_its_start(

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import bz2
 import gzip
-import lzma
-import sqlite3
 import struct
-import zipfile
-from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.convert.containers import described
+from pathspace_graph.convert.bag import described
 
 CASES = Path(__file__).parents[3] / "shared" / "cases"
 MAGIC = b"\x89MCAP0\r\n"
@@ -71,7 +66,7 @@ def test_messages_of_several_encodings_are_all_named(tmp_path: Path) -> None:
     file.write_bytes(mcap("x", {f"/topic{k}": "json" for k in range(20)}))
     assert described(file).count("/topic") == 8 and described(file).endswith(", ...")
     file.write_bytes(mcap("x", {}))
-    assert described(file) == "an MCAP file without topics (profile 'x')"
+    assert described(file) == "an MCAP file of no messages (profile 'x'), not of ROS 2: "
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
@@ -84,49 +79,26 @@ def test_one_that_was_cut_off_is_told_as_that(share: float, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (gzip.compress(b"#ROSBAG V2.0\n", mtime=0), "gzip has compressed"),
-        (bz2.compress(b"#ROSBAG V2.0\n"), "bzip2 has compressed"),
-        (lzma.compress(b"#ROSBAG V2.0\n"), "xz has compressed"),
-        (b"\x28\xb5\x2f\xfd rest", "zstd has compressed"),
-        (b"\x89HDF\r\n\x1a\n rest", "an HDF5 file"),
+        (gzip.compress(b"#ROSBAG V2.0\n", mtime=0), "a file that gzip has compressed as a whole"),
+        (b"\x28\xb5\x2f\xfd rest", "a file that zstd has compressed as a whole"),
         (b"ULog\x01\x12\x35\x01 rest", "a ULog of PX4"),
+        (b"PK\x03\x04 rest", "a ZIP archive"),
+        (b"SQLite format 3\x00 rest", "an SQLite database that is no bag"),
         (b"#ROSBAG V2.0\n", "a bag of ROS 1 that is damaged or was cut off"),
-        (b"t,vx,vy,wz\n0,1,0,0\n", "text that begins with 't,vx,vy,wz'"),
-        (b'{"t": 0}\n', "text in JSON"),
-        (b"", "an empty file"),
-        (bytes(range(256)), "a file of an unknown kind"),
+        (b"t,vx,vy,wz\n0,1,0,0\n", "a file of another kind"),
+        (b"", "a file of another kind"),
     ],
 )
 def test_a_file_of_another_kind_is_named(
     content: bytes, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "drives").mkdir()
+    assert described(tmp_path / "drives") == "an empty folder"
     for name in ("drive.bag", "drive.mcap", "drive.db3", "drive"):
         file = tmp_path / "drives" / name
         file.write_bytes(content)
-        assert f"expected a ROS bag, found {said}" in refused(file, capsys).replace("a file that ", "")
+        assert f"expected a ROS bag, found {said}" in refused(file, capsys)
         file.unlink()
-
-
-def test_archives_databases_and_folders_are_named(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "drive.zip", "w") as archive:
-        archive.writestr("drive.bag", "x")
-    assert described(tmp_path / "drive.zip") == "a ZIP archive"
-    with closing(sqlite3.connect(tmp_path / "drive.db3")) as database:
-        database.execute("CREATE TABLE poses (t REAL)")
-        database.commit()
-    assert described(tmp_path / "drive.db3").endswith("with the tables poses")
-    for name, said in (
-        ("log.toml", "a log"),
-        ("odometry.csv", "a folder of CSV files"),
-        ("a.bin", "a.bin, "),
-    ):
-        folder = tmp_path / name.partition(".")[0]
-        folder.mkdir()
-        (folder / name).write_text("x")
-        assert said in described(folder)
-    (tmp_path / "empty").mkdir()
-    assert described(tmp_path / "empty") == "an empty folder"
 
 
 @pytest.mark.skipif(not CASES.is_dir(), reason="the cases of others aren't beside the repository")

@@ -13,14 +13,14 @@ import pytest
 from scipy.spatial import KDTree
 
 from pathspace_graph.cli import main
-from pathspace_graph.convert.lines import DrivenPath, along_lines, are_lines, lines_of, resampled, thinned
+from pathspace_graph.convert.lines import ReckonedPath, along_lines, lines_of, resampled, spaced_apart
 from pathspace_graph.convert.messages import ALONE, DENSE, Points, points_of
 from pathspace_graph.convert.settings import Frames, LabelRule
 from pathspace_graph.estimators import make_online
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.io.log_files import read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.ros.stream import MessageStream
+from pathspace_graph.ros.node import MessageStream
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import sampled
@@ -107,9 +107,9 @@ def test_dense_points_are_thinned_by_bearing_to_a_spacing() -> None:
     # a wall 2 m to the right from behind to ahead: bearings grow with x
     x = np.arange(-1.0, 1.0, 0.1)
     wall = np.column_stack([x, np.full(20, -2.0)])
-    kept = thinned(wall[::-1], 0.35, np.ones(20, bool))
+    kept = spaced_apart(wall[::-1], 0.35, np.ones(20, bool))
     np.testing.assert_allclose(wall[::-1][kept][:, 0], [-1.0, -0.6, -0.2, 0.2, 0.6], atol=1e-12)
-    assert thinned(wall, 0.35, np.zeros(20, bool)).tolist() == []
+    assert spaced_apart(wall, 0.35, np.zeros(20, bool)).tolist() == []
 
 
 def test_thinning_does_not_choose_by_range() -> None:
@@ -117,7 +117,7 @@ def test_thinning_does_not_choose_by_range() -> None:
     angles = np.linspace(-1.0, 1.0, 2001)
     ranges = 2.0 + 0.05 * rng.standard_normal(2001)
     points = ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-    kept = thinned(points, 0.05, np.ones(2001, bool))
+    kept = spaced_apart(points, 0.05, np.ones(2001, bool))
     assert np.hypot(*points[kept].T).mean() == pytest.approx(2.0, abs=0.015)
     apart = np.linalg.norm(points[kept][:, None] - points[kept], axis=2) + np.eye(len(kept))
     assert apart.min() >= 0.05
@@ -130,20 +130,11 @@ def test_polylines_keep_their_labels_and_lose_no_other_points() -> None:
     assert found.labels.tolist() == [UNKNOWN, LEFT, LEFT, LEFT]
 
 
-def test_a_record_is_of_lines_where_nothing_stands_alone_or_where_a_spacing_is_stated() -> None:
-    alone, dense = (Points.of([[1.0, 1.0]], [LEFT], lines=line) for line in (ALONE, DENSE))
-    empty = Points.of([], [])
-    assert are_lines(Points.joined([dense, empty]), None)
-    assert not are_lines(Points.joined([alone, dense]), None)
-    assert not are_lines(empty, None)
-    assert are_lines(alone, 0.5)
-
-
 # --- sides -----------------------------------------------------------------------------------------------
 
 
 def test_the_distance_to_the_left_of_the_way_is_that_of_the_stretch_around_the_vehicle() -> None:
-    path = DrivenPath.of(AHEAD, 0.01)
+    path = ReckonedPath.of(AHEAD, 0.01)
     points = np.array([[2.0, 1.5], [2.0, -1.0], [-3.0, 1.0], [-6.0, 1.0], [6.0, 1.0]])
     # at 5 s the vehicle is at x = 5: the last two points are beyond the ends of the way
     np.testing.assert_allclose(path.lateral(5.0, points), [1.5, -1.0, 1.0, np.nan, np.nan], atol=1e-3)
@@ -155,7 +146,7 @@ def test_a_stretch_that_comes_near_later_does_not_decide_a_side() -> None:
     straight, bend = np.zeros(1000), np.full(round(np.pi * 300), 1.0 / 3.0)
     turn = np.concatenate([straight, bend, straight])
     twists = np.column_stack([np.ones(len(turn)), np.zeros(len(turn)), turn])
-    path = DrivenPath.of(Odometry(np.arange(len(turn)) / rate, twists), 0.02)
+    path = ReckonedPath.of(Odometry(np.arange(len(turn)) / rate, twists), 0.02)
     # 3.8 m to the left, nearer to the way back, is left of the way there, and of the way back as well
     there = path.lateral(2.0, np.array([[0.0, 3.8]]))
     np.testing.assert_allclose(there, [3.8], atol=0.02)

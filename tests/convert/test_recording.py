@@ -14,13 +14,13 @@ from pathspace_graph.convert.recording import (
     Recording,
     positive_definite,
     to_log,
+    twists_between,
     windowed,
 )
 from pathspace_graph.convert.settings import Frames, NoiseSettings, Window
-from pathspace_graph.convert.twists import twists_between
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.se2 import compose, se2_exp
-from pathspace_graph.io.covariances import ray_covariances
+from pathspace_graph.io.log import ray_covariances
 
 FILE = Path("drive")
 

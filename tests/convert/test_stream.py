@@ -11,7 +11,7 @@ import pytest
 from pathspace_graph import FixedLagMapper, ReadingError
 from pathspace_graph.convert.settings import Frames
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.ros.stream import MessageStream
+from pathspace_graph.ros.node import MessageStream
 
 from .bags import EPOCH, Messages
 

@@ -128,22 +128,21 @@ def test_stamps_in_two_columns_are_seconds_and_nanoseconds(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("columns", "said"),
     [
-        ("t=sec", "stamps of their own, found the stamp of another one in 45 of 60: are these whole seconds"),
+        ("t=sec", "stamps of their own, found the stamp of another one in 45 of 60"),
         ("t=nsec", "stamps of their own, found the stamp of another one in 56 of 60"),
         ("t=nsec+sec", "expected nanoseconds from 0 to 999999999 in column 'sec'"),
-        ("t=sec+nanosec", "expected a column 'nanosec' for t"),
-        ("t=sec+usec", "expected nanoseconds in column 'usec', found at most 750000"),
-        ("vx=vx", "expected a column 't' for t (--columns t=NAME, or t=SECONDS+NANOSECONDS)"),
+        ("t=sec+nanosec", "expected a column 'nanosec'"),
+        ("vx=vx", "expected a column 't', or t=SECONDS+NANOSECONDS (--columns t=NAME)"),
     ],
 )
 def test_a_wrong_choice_of_the_stamps_is_refused(
     columns: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Four samples in each of 15 seconds; of whole seconds, all but one of each second would be lost."""
-    times = [f"{BEGIN + k // 4},{250_000_000 * (k % 4)},{250_000 * (k % 4)}" for k in range(60)]
+    times = [f"{BEGIN + k // 4},{250_000_000 * (k % 4)}" for k in range(60)]
     odometry = "".join(f"{t},{1 + 0.01 * k},0\n" for k, t in enumerate(times))
     detections = "".join(f"{t},4,1\n" for t in times)
-    folder = write(tmp_path, f"sec,nsec,usec,vx,wz\n{odometry}", f"sec,nsec,usec,x,y\n{detections}")
+    folder = write(tmp_path, f"sec,nsec,vx,wz\n{odometry}", f"sec,nsec,x,y\n{detections}")
     units = ["--units", "time=ns"] if columns == "t=nsec" else []
     assert said in refused(folder, capsys, "--columns", columns, *units)
 
@@ -154,52 +153,7 @@ def test_an_odometry_that_is_repeated_beside_each_detection_counts_once(tmp_path
     np.testing.assert_array_equal(log.odometry.twist[:, 0], np.arange(10.0))
 
 
-@pytest.mark.parametrize(
-    "dates",
-    [
-        [
-            "2024-05-01T10:00:00Z",
-            "2024-05-01T10:00:00.5Z",
-            "2024-05-01T10:00:01.020Z",
-            "2024-05-01T10:00:01.999000Z",
-        ],
-        [
-            "2024-05-01 10:00:00",
-            "2024-05-01 10:00:00.500",
-            "2024-05-01 10:00:01.02",
-            "2024-05-01 10:00:01.999000000",
-        ],
-        [
-            "2024-05-01T12:00:00+02:00",
-            "2024-05-01T12:00:00.5+02:00",
-            "2024-05-01T12:00:01.02+0200",
-            "2024-05-01T12:00:01.999+02",
-        ],
-        [
-            "2024-05-01 05:00:00-05:00",
-            "2024-05-01 05:00:00.5-0500",
-            "2024-05-01 10:00:01.02Z",
-            "20240501T100001,999Z",
-        ],
-    ],
-)
-def test_stamps_may_be_dates(dates: list[str], tmp_path: Path) -> None:
-    odometry = "t;vx;wz\n" + "".join(f"{date};1;0\n" for date in dates)
-    detections = "t;x;y\n" + "".join(f"{date};4;1\n" for date in dates)
-    log = convert(write(tmp_path, odometry, detections))
-    np.testing.assert_allclose(log.odometry.t, STAMPS, rtol=0.0, atol=3e-7)
-    np.testing.assert_allclose([cycle.t for cycle in log.cycles], STAMPS, rtol=0.0, atol=3e-7)
-
-
-def test_a_date_that_is_none_is_named_with_its_row(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    odometry = "t,vx,wz\n2024-05-01T10:00:00Z,1,0\n2024-13-01T10:00:00Z,1,0\n"
-    said = refused(write(tmp_path, odometry, GOOD_DETECTIONS), capsys)
-    assert "odometry.csv, row 3: expected a date by ISO 8601 in column 't'" in said
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
 @pytest.mark.parametrize(
     ("delimiter", "point"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")]
 )
@@ -248,12 +202,12 @@ GOOD_DETECTIONS = "t,x,y,label\n0.1,4,1,left\n0.3,4,1,left\n"
         ("", GOOD_DETECTIONS, [], "odometry.csv"),
         ("t,vx,wz\n", GOOD_DETECTIONS, [], "odometry.csv, row 2: expected at least one row"),
         ("t,v,wz\n0,1,0\n", GOOD_DETECTIONS, [], "(--columns vx=NAME), found the columns t, v, wz"),
-        (GOOD_ODOMETRY, "t,x,z\n0,1,0\n", [], "expected a column 'y' for y"),
-        (GOOD_ODOMETRY, "t,z\n0,1\n", [], "detections.csv, row 1: expected the columns x and y"),
+        (GOOD_ODOMETRY, "t,x,z\n0,1,0\n", [], "expected a column 'y', or range and bearing"),
+        (GOOD_ODOMETRY, "t,z\n0,1\n", [], "detections.csv, row 1: expected a column 'x'"),
         (GOOD_ODOMETRY, "t,x,y\n0,1,a\n", [], "csv, row 2: expected a number in column 'y', found 'a'"),
         (GOOD_ODOMETRY, "t,x,y\n0,1,\n", [], "can be used, found 1 messages without any; 1 detections that"),
         ("t,vx,wz\n,1,0\n", GOOD_DETECTIONS, [], "row 2: expected a number in column 't', found ''"),
-        (GOOD_ODOMETRY, "t,range\n0.1,1\n", [], "expected the columns x and y, or range and bearing"),
+        (GOOD_ODOMETRY, "t,range\n0.1,1\n", [], "expected a column 'bearing' (--columns bearing=NAME)"),
         (GOOD_ODOMETRY, "t,x,y,xx\n0,1,1,1\n", [], "expected a column 'xy'"),
         (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--columns", "speed=v"], "expected one of t, vx, vy, wz, x"),
         (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--columns", "vx"], "--columns: expected QUANTITY=COLUMN"),
@@ -262,10 +216,8 @@ GOOD_DETECTIONS = "t,x,y,label\n0.1,4,1,left\n0.3,4,1,left\n"
         (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--columns", "vy=v"], "expected a column 'v' for vy"),
         (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--units", "time=h"], "expected time= one of s, ms, us, ns"),
         (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--units", "length:mm"], "--units: expected one of time, length"),
-        (GOOD_ODOMETRY, GOOD_DETECTIONS, ["--units", "time=ns"], "is their unit another one?"),
-        ("t,vx,wz\n1700000000000000000,1,0\n", GOOD_DETECTIONS, [], "(--units time=ns)?"),
-        (GOOD_ODOMETRY, "t,range,bearing\n0.1,3,45\n", [], "expected bearings of at most a whole turn"),
         (GOOD_ODOMETRY, "t,range,bearing\n0.1,-3,1\n", [], "expected ranges of at least 0"),
+        ("t,vx,wz\n1700000000000000000,1,0\n", GOOD_DETECTIONS, [], "in s, at most 1e+10, found 1.7e+18"),
         ("t,vx,wz\n0,5000,0\n1,1,0\n", GOOD_DETECTIONS, [], "first vx = 5000 m/s in odometry.csv, row 2"),
         (GOOD_ODOMETRY, "t,x,y\n7,1,1\n", [], "expected detections in the time of the odometry"),
         ("t,vx,wz\n0,1,0\n1,1,0\n40,1,0\n41,1,0\n", "t,x,y\n1,4,1\n41,4,1\n", [], "(odometry.csv, row 4)"),

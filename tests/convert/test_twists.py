@@ -13,7 +13,7 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.commands.convert import with_measured_noise
-from pathspace_graph.convert import twists
+from pathspace_graph.convert import recording
 from pathspace_graph.convert.recording import strays
 from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.io.log import Log, Odometry
@@ -82,7 +82,7 @@ def convert(source: Path, *options: str, code: int = 0) -> Path:
 @pytest.mark.parametrize("seed", range(5))
 def test_no_row_of_a_drive_as_it_is_jumps(seed: int, step: int) -> None:
     t, *rest = table(drive(seed), step).T
-    assert not twists.jumps(t, np.array(rest).T).any()
+    assert not recording.jumps(t, np.array(rest).T).any()
 
 
 @pytest.mark.parametrize("central", [False, True])
@@ -90,7 +90,7 @@ def test_no_row_of_a_drive_as_it_is_jumps(seed: int, step: int) -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_a_yaw_that_wraps_is_found_at_any_rate(seed: int, step: int, central: bool) -> None:
     rows, wrong = differenced(drive(seed), step, central=central)
-    off = twists.jumps(rows[:, 0], rows[:, 1:])
+    off = recording.jumps(rows[:, 0], rows[:, 1:])
     assert wrong
     assert {*np.flatnonzero((off != 0.0).any(axis=1)).tolist()} == wrong
 
@@ -102,17 +102,17 @@ def test_a_jump_is_one_beyond_what_a_vehicle_accelerates(column: int, most: floa
     for jump, found in ((0.99 * most, []), (1.01 * most, [100])):
         values = np.ones((len(t), 3))
         values[100, column] += jump
-        assert np.flatnonzero(twists.jumps(t, values).any(axis=1)).tolist() == found
+        assert np.flatnonzero(recording.jumps(t, values).any(axis=1)).tolist() == found
 
 
 def test_a_ramp_a_step_and_what_lies_behind_a_gap_do_not_jump() -> None:
     t = np.arange(0.0, 4.0, 0.02)
     ramp = np.clip(15.0 * (t - 1.0), 0.0, 20.0)
     step = np.where(t < 2.0, 0.0, 8.0)  # wheels that spin
-    assert not twists.jumps(t, np.column_stack([ramp, step, step])).any()
+    assert not recording.jumps(t, np.column_stack([ramp, step, step])).any()
     beyond = np.where(t < 3.98, 10.0, 2.0)
     t[-1] += 2.0
-    assert not twists.jumps(t, np.column_stack([beyond, 0.0 * t, 0.0 * t])).any()
+    assert not recording.jumps(t, np.column_stack([beyond, 0.0 * t, 0.0 * t])).any()
 
 
 @pytest.mark.parametrize("central", [False, True])
@@ -153,7 +153,7 @@ def test_a_few_rows_beyond_any_vehicle_are_left_out_and_many_refused(
     convert(write(tmp_path, drive(), rows), code=code)
     said = capsys.readouterr()
     if code:
-        assert said.err.count("\n") == 1 and "is the unit right (--units" in said.err
+        assert said.err.count("\n") == 1 and "--units states others" in said.err
         assert (
             f"{len(wrong)} of {len(rows)} beyond, at first wz = 40 rad/s in odometry.csv, row 12" in said.err
         )
@@ -250,10 +250,10 @@ def test_a_trajectory_of_tum_is_read_as_poses(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "options", "said"),
     [
-        ("t,x,y,yaw", [], "is it in degrees (--units angle=deg)?"),
-        ("t,vx,vy,wz", ["--from-poses"], "--from-poses: expected the columns x, y and yaw"),
-        ("t,x,y,course", [], "expected a column 'vx' for vx, or a pose x, y, yaw"),
-        ("t,x,y,course", ["--from-poses"], "--from-poses: expected the columns x, y and yaw"),
+        ("t,x,y,yaw", [], "expected speeds of at most 100 m/s and yaw rates of 10 rad/s, found"),
+        ("t,vx,vy,wz", ["--from-poses"], "expected a column 'x' for --from-poses"),
+        ("t,x,y,course", [], "expected a column 'vx', or a pose x, y, yaw (--columns vx=NAME)"),
+        ("t,x,y,course", ["--from-poses"], "expected a column 'yaw' for --from-poses"),
         ("0.1,2,3,4", [], "odometry.csv, row 1: expected a header with the names of the columns"),
     ],
 )
@@ -294,10 +294,10 @@ def test_a_pose_that_was_not_measured_anew_is_no_pose() -> None:
     """A receiver of 10 Hz whose pose comes at 50 Hz; then the vehicle stands for 2 s."""
     t = np.arange(0.0, 4.0, 0.02)
     x = np.minimum(np.floor(t / 0.1 + 1e-9) * 0.5, 10.0)
-    new = twists.measured_anew(t, np.column_stack([x, x, x]))
+    new = recording.measured_anew(t, np.column_stack([x, x, x]))
     assert new[t <= 2.0 + 1e-9].sum() == 21
-    assert not new[(t > 2.01) & (t < 2.0 + twists.FROZEN - 0.01)].any()
-    assert new[t > 2.0 + twists.FROZEN + 0.01].all()
+    assert not new[(t > 2.01) & (t < 2.0 + recording.FROZEN - 0.01)].any()
+    assert new[t > 2.0 + recording.FROZEN + 0.01].all()
 
 
 # --- slow twists -----------------------------------------------------------------------------------------
@@ -307,8 +307,9 @@ def test_a_pose_that_was_not_measured_anew_is_no_pose() -> None:
     ("period", "parts"), [(0.02, 1), (0.1, 1), (0.119, 1), (0.121, 3), (0.2, 4), (1.0, 20)]
 )
 def test_twists_slower_than_a_tenth_of_a_second_are_interpolated(period: float, parts: int) -> None:
-    assert twists.parts_of(period * np.arange(30)) == parts
-    assert twists.parts_of(period * np.arange(10)) == 1  # too few to know their period
+    assert recording.parts_of(period * np.arange(30)) == parts
+    assert recording.parts_of(period * np.arange(10)) == 1  # too few to know their period
+    assert recording.parts_of(1e3 * np.arange(30)) == 1  # milliseconds, which a hint tells
 
 
 def test_interpolated_twists_have_the_means_of_what_was_driven() -> None:
@@ -318,7 +319,7 @@ def test_interpolated_twists_have_the_means_of_what_was_driven() -> None:
     def speed(at: np.ndarray) -> np.ndarray:
         return np.outer(np.sin(0.5 * np.pi * at), np.ones(3))
 
-    odometry = twists.interpolated(t, speed(t), 4)
+    odometry = recording.interpolated(t, speed(t), 4)
     np.testing.assert_allclose(np.diff(odometry.t), 0.05)
     driven = np.cumsum(np.diff(odometry.t)[:, None] * odometry.twist[:-1], axis=0)
     whole = (1.0 - np.cos(0.5 * np.pi * odometry.t[1:])) / (0.5 * np.pi)
@@ -329,7 +330,7 @@ def test_interpolated_twists_have_the_means_of_what_was_driven() -> None:
 
 def test_nothing_is_interpolated_over_a_gap() -> None:
     t = np.array([0.0, 0.2, 0.4, 0.6, 2.0, 2.2, 2.4])
-    odometry = twists.interpolated(t, np.outer(np.arange(7.0), np.ones(3)), 2)
+    odometry = recording.interpolated(t, np.outer(np.arange(7.0), np.ones(3)), 2)
     assert odometry.t.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 2.0, 2.1, 2.2, 2.3, 2.4])
     assert odometry.twist[6].tolist() == [3.0, 3.0, 3.0]
 
@@ -354,7 +355,7 @@ def test_the_noise_of_interpolated_twists_is_that_of_the_samples() -> None:
     log = drive()
     t, rows = log.odometry.t[::10], log.odometry.twist[::10]
     slow = replace(log, odometry=Odometry(t, rows), odometry_stated=False)
-    fine = replace(slow, odometry=twists.interpolated(t, rows, 4))
+    fine = replace(slow, odometry=recording.interpolated(t, rows, 4))
     held, found = with_measured_noise(slow).measured, with_measured_noise(fine, 4).measured
     assert held is not None and found is not None
     assert found.interval == pytest.approx(0.25 * held.interval)

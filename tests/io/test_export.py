@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.export import (
     LocalPlane,
-    sampled,
+    spaced,
     write_centre_line,
     write_geojson,
     write_lanelet2,
@@ -41,7 +41,7 @@ every_map = pytest.mark.parametrize("make", [ring_map, open_map])
 def points_of(track: Map, label: int, step: float) -> Array:
     boundary = track.boundaries[label]
     assert isinstance(boundary, SplineBoundary)
-    return sampled(boundary.spline, step)
+    return spaced(boundary.spline, step)
 
 
 @every_map

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.map import Map, SplineBoundary, as_ribbon, map_of, ribbon_of
+from pathspace_graph.io.map import Map, SplineBoundary, as_ribbon, map_of_ribbon, ribbon_of
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 
 from ..scenes.maps import SIGMA, open_map, point_map, ring_map
@@ -32,12 +32,12 @@ def test_the_edges_of_a_ribbon_are_the_boundaries() -> None:
 def test_a_ribbon_is_found_again_from_its_own_edges() -> None:
     """Their covariance is that of the edges across themselves."""
     ribbon = ribbon_of(ring_map())[0]
-    track = map_of(ribbon, 0.01**2 * np.eye(3 * ribbon.size), SIGMA, {})
+    track = map_of_ribbon(ribbon, 0.01**2 * np.eye(3 * ribbon.size), SIGMA, {})
     fitted, known, _ = ribbon_of(track)
     u = np.linspace(0.0, ribbon.tables.high, 100)
     np.testing.assert_allclose(np.hypot(*fitted.centre.evaluate(u).T), 20.0, atol=0.01)
     np.testing.assert_allclose(fitted.half_width(u), 2.0, atol=0.01)
-    again = map_of(fitted, known, 0.0, {})
+    again = map_of_ribbon(fitted, known, 0.0, {})
     for label in BOUNDARIES:
         first, second = (curve_of(one, label) for one in (track, again))
         at = np.linspace(*first.spline.domain, 50)

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pathspace_graph import FixedLagMapper, MapperSettings
-from pathspace_graph.batch.lap import LapMarginal
+from pathspace_graph.batch.lap import LapMarginal, OpenLap
 from pathspace_graph.batch.mapper import BatchMapper
+from pathspace_graph.batch.start import REVISIT_INTERVAL
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import relative, to_vehicle
+from pathspace_graph.factors.se2 import path_lengths, relative, to_vehicle
 from pathspace_graph.graph.gaussian import keys_of, normal_equations
 from pathspace_graph.graph.rows import revisit_rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop import drive as drive_module
-from pathspace_graph.loop.drive import Drive, Step
+from pathspace_graph.loop.drive import Drive, DriveRecord, Step
 from pathspace_graph.loop.lap_solver import Outcome
 from pathspace_graph.loop.open import NOT_REVISITED, Open, Revisits, earlier_pass
 from pathspace_graph.mapping.road import Road
@@ -133,10 +135,13 @@ class Replaced:
 def replaced() -> list[Replaced]:
     """Return the replacements of a drive, without the steps that follow each."""
     found, take = list[Replaced](), drive_module.swap_in
+    """The priors of the calibrations have changed since each batch began."""
 
     def swap_in(road: Road, marginal: LapMarginal) -> Array:
         before, after = road.copy(), road.copy()
         before.smoother.transform_to_origin()
+        mean, sigma = after.smoother.calibration_prior
+        after.smoother.set_calibration_priors(mean + 0.1 * sigma, 0.5 * sigma)
         with pytest.MonkeyPatch.context() as without_steps:
             without_steps.setattr(CurveSmoother, "step", lambda *_: None)
             found.append(Replaced(marginal, before, after, take(after, marginal)))
@@ -188,14 +193,15 @@ def test_the_prior_is_the_marginal_with_the_present_priors_of_the_calibrations()
         layout = Layout(np.sort(keys_of(smoother.prior)))
         information, vector = normal_equations(smoother.prior, layout)
         own, expected = slice(0, len(marginal.calibration)), marginal.information.copy()
-        sigmas = smoother.calibration_prior[1], marginal.calibration_prior[1]
-        expected[own, own] += np.diag(sigmas[0] ** -2.0 - sigmas[1] ** -2.0)
+        (mean, sigma), (mean_then, sigma_then) = smoother.calibration_prior, marginal.calibration_prior
+        expected[own, own] += np.diag(sigma**-2.0 - sigma_then**-2.0)
         scale = np.sqrt(np.diagonal(expected))
         assert np.abs((information - expected) / np.outer(scale, scale)).max() < 1e-9
-        if (sigmas[0] == sigmas[1]).all():
-            reference = smoother.variables.reference[smoother.variables.layout.entries(layout.keys)]
-            off = reference + np.linalg.solve(information, vector) - marginal.mean
-            assert off @ information @ off < 1e-6
+        right = marginal.information @ marginal.mean
+        right[own] += mean / sigma**2 - mean_then / sigma_then**2
+        reference = smoother.variables.reference[smoother.variables.layout.entries(layout.keys)]
+        off = reference + np.linalg.solve(information, vector) - np.linalg.solve(expected, right)
+        assert off @ information @ off < 1e-6
 
 
 def test_a_curve_that_was_taken_back_meanwhile_keeps_its_map(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -209,6 +215,21 @@ def test_a_curve_that_was_taken_back_meanwhile_keeps_its_map(monkeypatch: pytest
     mapper, results = map_log(drive())
     assert not mapper.revisits and all(result.jump is None for result in results)
     assert any(result.notice == f"{NOT_REVISITED}: a curve was taken back" for result in results)
+
+
+def test_a_batch_has_all_revisits_so_far_some_metres_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, record = list[int](), DriveRecord.lap
+
+    def lap(self: DriveRecord, *arguments: Any, **options: Any) -> OpenLap:
+        made = record(self, *arguments, **options)
+        asked.append(len(made.revisits))
+        return made
+
+    monkeypatch.setattr(DriveRecord, "lap", lap)
+    mapper, _ = map_log(drive())
+    assert asked[: len(mapper.revisits)] == [*range(1, len(mapper.revisits) + 1)]
+    driven = path_lengths(true_poses(drive()))[[one.later for one in mapper.revisits]]
+    assert np.diff(driven).min() > REVISIT_INTERVAL - 1.0
 
 
 def test_the_batch_takes_them_from_the_online_run() -> None:
@@ -226,7 +247,7 @@ def test_the_batch_takes_them_from_the_online_run() -> None:
 
 def test_a_window_that_holds_the_whole_drive_has_none_and_fails_in_no_cycle() -> None:
     settings = MapperSettings(lag=60.0, max_poses=1000)
-    log = beginning(drive(), 130)
+    log = beginning(drive(), 180)
     mapper, _ = map_log(log, FixedLagMapper(settings, log.odometry_sigma))
     assert mapper.failures == 0 and not mapper.revisits
 

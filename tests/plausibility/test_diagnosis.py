@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
+from pathspace_graph.factors.odometry import CALIBRATION
 from pathspace_graph.factors.sensor import SENSOR
-from pathspace_graph.io.header import CALIBRATION
 from pathspace_graph.io.results import RunNoise, VehicleState
 from pathspace_graph.plausibility.diagnosis import (
     CALIBRATION_CAUSES,

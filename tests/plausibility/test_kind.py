@@ -11,9 +11,7 @@ import pytest
 
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.labels import KINDS, LEFT, RIGHT, Kind
-from pathspace_graph.plausibility.hint import objections
-from pathspace_graph.plausibility.judge import hints
-from pathspace_graph.plausibility.kind import is_line
+from pathspace_graph.plausibility.judge import hints, is_line, objections
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import short_drive

@@ -12,17 +12,16 @@ from hypothesis import strategies as st
 from pathspace_graph import hints
 from pathspace_graph.factors.se2 import relative, se2_exp, to_vehicle
 from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.plausibility.hint import Hint, objections
-from pathspace_graph.plausibility.judge import SPEED_UNITS, unit_of
+from pathspace_graph.plausibility.judge import SPEED_UNITS, Hint, objections, unit_of
 from pathspace_graph.plausibility.regression import (
     LAGS,
     Fit,
     Motions,
     Regression,
     far_better,
+    mean_twist,
     motions_of,
     register,
-    twist_of,
 )
 
 from ..scenes.drives import ahead, corridor, exact_log, short_drive
@@ -43,7 +42,7 @@ def seen(pose: np.ndarray, mirror: float = 1.0) -> Detections:
 @given(st.floats(-20.0, 20.0), st.floats(-5.0, 5.0), st.floats(-3.0, 3.0))
 def test_the_twist_of_a_motion_leads_to_it(vx: float, vy: float, rate: float) -> None:
     motion = se2_exp(0.3 * np.array([[vx, vy, rate]]))[0]
-    np.testing.assert_allclose(twist_of(motion, 0.3), [vx, vy, rate], atol=1e-6)
+    np.testing.assert_allclose(mean_twist(motion, 0.3), [vx, vy, rate], atol=1e-6)
 
 
 @pytest.mark.parametrize("mirror", [1.0, -1.0])

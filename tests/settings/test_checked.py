@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.options.map import Online
+from pathspace_graph.options.runs import Online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.sensor import OdometryNoise
 

@@ -49,22 +49,6 @@ def test_a_bend_by_which_farther_cones_would_read_nearer_is_refused() -> None:
         SensorSettings(range_bend_from=-1.0)
 
 
-def test_speeds_and_ranges_have_scales_of_their_own() -> None:
-    sensor = SensorSettings(range_sigma=1e-9, range_sigma_growth=0.0, bearing_sigma=1e-9, false_positives=0.0)
-    odometry = OdometryFaults(speed_scale=0.02, yaw_rate_bias=0.003)
-    faults = Faults(sensor=SensorFaults(range_scale=-0.05), odometry=odometry)
-    settings = SimulationSettings(laps=1, odometry=QUIET, sensor=sensor, faults=faults)
-    log, exact = (simulate(bean_track(), one, 0) for one in (settings, replace(settings, faults=Faults())))
-    np.testing.assert_allclose(log.odometry.twist[:, :2], 1.02 * exact.odometry.twist[:, :2], atol=1e-7)
-    np.testing.assert_allclose(log.odometry.twist[:, 2], exact.odometry.twist[:, 2] + 0.003, atol=1e-7)
-    for short, true in zip(log.cycles, exact.cycles, strict=True):
-        np.testing.assert_allclose(short.points_vehicle, 0.95 * true.points_vehicle, atol=1e-6)
-    assert log.truth is not None and log.truth.calibration is not None
-    np.testing.assert_allclose(log.truth.calibration, [0.02, 0.003])
-    assert log.source["faults.odometry.yaw_rate_bias"] == "0.003"
-    assert log.source["faults.odometry.speed_scale"] == "0.02"
-
-
 @cache
 def stopping(false_travel: float) -> Log:
     """One lap, after which the vehicle stands for 6 s and its odometry goes on for 3 s."""
@@ -83,24 +67,6 @@ def test_the_vehicle_brakes_and_stands_at_the_end(false_travel: float) -> None:
     at = [np.searchsorted(truth.pose_t, t) for t in np.arange(last - 8.0, last - 6.0, 0.2)]
     speeds = np.linalg.norm(np.diff(truth.poses[at, :2], axis=0), axis=1) / 0.2
     assert speeds[0] > 3.0 and np.diff(speeds).min() > -0.2 * 4.0 - 0.05  # the greatest deceleration
-
-
-def test_odometry_goes_on_at_its_speed_and_for_its_time_while_the_world_stands() -> None:
-    log, whole = stopping(1.3), stopping(0.0)
-    assert whole.truth is not None
-    begin = log.odometry.t[-1] - 6.0
-    standing = log.odometry.t > begin + 0.01
-    vx, vy, wz = log.odometry.twist[standing].T
-    assert vx.sum() / 50.0 == pytest.approx(1.3 * 3.0, abs=1.3 / 50.0)
-    assert vx.max() == pytest.approx(1.3, abs=1e-6)
-    np.testing.assert_allclose([vy, wz], 0.0, atol=1e-6)
-    # while it brakes the speed falls to that and no farther; before, nothing is different
-    brakes = (log.odometry.t > begin - 2.0) & ~standing
-    np.testing.assert_allclose(
-        log.odometry.twist[brakes, 0], np.maximum(whole.odometry.twist[brakes, 0], 1.3), atol=1e-6
-    )
-    for seen, same in zip(log.cycles, whole.cycles, strict=True):
-        np.testing.assert_array_equal(seen.points_vehicle, same.points_vehicle)
 
 
 def test_false_travel_needs_a_vehicle_that_stands() -> None:

@@ -343,17 +343,3 @@ def test_a_log_names_its_faults_and_one_without_faults_has_no_such_line(clean: L
     again = read_log(tmp_path / "log")
     assert again.source == faulty.source
     assert same_cycles(again, faulty)
-
-
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
-        (lambda: SensorFaults(latency=float("inf")), "faults.sensor.latency: expected a number"),
-        (lambda: SensorFaults(range_scale=-1.0), "faults.sensor.range_scale: expected more than -1"),
-        (lambda: OdometryFaults(slip_every=0.0), "faults.odometry.slip_every: expected a positive"),
-        (lambda: VehicleFaults(put_down=-5.0), "faults.vehicle.put_down"),
-    ],
-)
-def test_a_wrong_setting_is_refused(make: type, says: str) -> None:
-    with pytest.raises(SettingsError, match=says):
-        make()

@@ -14,7 +14,7 @@ from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.sim.lines import LINE, BoundaryCurve, LineSensor, LineSettings, as_lines
+from pathspace_graph.sim.lines import LINE, LineSensor, LineSettings, as_lines, curve_through
 from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track import Track, skidpad
 
@@ -53,7 +53,7 @@ def test_the_true_boundary_is_the_smooth_curve_through_the_cones() -> None:
         gaps = np.linalg.norm(np.diff(np.vstack([row, row[:1]]), axis=0), axis=1)
         assert gaps.max() < 1.0
         np.testing.assert_allclose(gaps, AROUND * radius / len(row), atol=1e-3)
-        assert BoundaryCurve(row, True).length == pytest.approx(AROUND * radius, rel=1e-5)
+        assert curve_through(row, True).length == pytest.approx(AROUND * radius, rel=1e-5)
     assert set(lines.cone_labels[: len(lines.left)]) == {LEFT}
     assert set(lines.cone_labels[len(lines.left) :]) == {RIGHT}
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.laps import lap_end_indices
-from pathspace_graph.sim.curves import CentreLine, left_normals
+from pathspace_graph.sim.curves import SmoothCurve, left_normals
 from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.sim.vehicle import Drive, VehicleSettings, _settling, _wander, drive, integrate
@@ -142,7 +142,7 @@ def test_a_start_beside_a_bend_begins_in_its_own_direction() -> None:
     at = np.linspace(0.0, 20.0 * np.pi, 401)
     circle = 10.0 * np.column_stack([np.cos(at / 10.0), np.sin(at / 10.0)])
     circle[-1] = circle[0]
-    line = CentreLine(CubicSpline(at, circle, bc_type="periodic"), at[-1], True, np.full(401, 2.0))
+    line = SmoothCurve(CubicSpline(at, circle, bc_type="periodic"), at[-1], True, np.full(401, 2.0))
     pose = line.points(np.array([0.0]))[0] + 2.0 * left_normals(line.tangents(np.array([0.0])))[0]
     heading = np.arctan2(*line.tangents(np.array([0.0]))[0][::-1]) + 0.3
     s = np.array([0.0, 1e-4])

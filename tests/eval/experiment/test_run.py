@@ -21,7 +21,7 @@ from pathspace_graph.eval.experiment.statistics import TIMES
 from pathspace_graph.eval.experiment.study import Drive, Study
 from pathspace_graph.eval.experiment.tables import without_times, write_study
 from pathspace_graph.io.log import Log
-from pathspace_graph.plausibility.hint import Hint
+from pathspace_graph.plausibility.judge import Hint
 
 from ...scenes.pretenders import Fragile, Pretender, contents, register, write_round_track
 
