@@ -10,7 +10,7 @@ repair starts from a closed map. An open road keeps the curves of its map, which
 """
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -107,7 +107,8 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             scatter = {label: simple.scatter.of_control_points(label, boundary) for label, boundary in curves}
             objection = evidence_against(system, at, few.splines, simple.detections)
         else:
-            objection = disagreement(system, at.state.poses, at.state.variables.calibration)
+            calibration, earlier = at.state.variables.calibration, lap.revisits[1:]
+            objection = disagreement(system, at.state.poses, calibration, earlier)
         information, mean, dense = marginal_of(system, at, few, change, lap.first_kept)
         if system.matches is not None:
             stations = stations_on(few, system.matches, at.state, change, dense)
@@ -278,17 +279,21 @@ def evidence_against(
     return disagreement(system, poses, calibration) or objection(splines, poses, used)
 
 
-def disagreement(system: BatchSystem, poses: Array, calibration: Array) -> str:
+def disagreement(
+    system: BatchSystem, poses: Array, calibration: Array, revisits: Sequence[Revisit] | None = None
+) -> str:
     """Describe how the poses (P, 3) of an optimum contradict odometry and revisits; empty if they agree.
 
     Both are estimates of one drive, so they differ by some standard deviations of the less certain one. A
     wrong optimum bends the drive by much more, to fit the map. The odometry is corrected by the calibration
-    (2,) of the optimum: what contradicts its prior widens that, and does not bend the drive.
+    (2,) of the optimum: what contradicts its prior widens that, and does not bend the drive. By default all
+    `revisits` count; where no closed curve speaks against a wrong one, it must agree with the others.
     """
     if not system.revisits:
         return ""
+    revisits = system.revisits if revisits is None else revisits
     calibrated = replace(system.chain, calibration_mean=calibration)
-    sigmas = aligned_odometry(calibrated, system.revisits).disagreement(poses)
+    sigmas = aligned_odometry(calibrated, revisits).disagreement(poses)
     return f"the poses are {sigmas:.1f} sigmas from the odometry" if sigmas > BENT_SIGMAS else ""
 
 

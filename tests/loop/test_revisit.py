@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph import FixedLagMapper, MapperSettings
-from pathspace_graph.batch.lap import LapMarginal, OpenLap
+from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.start import REVISIT_INTERVAL
 from pathspace_graph.factors.arrays import Array
@@ -217,19 +217,48 @@ def test_a_curve_that_was_taken_back_meanwhile_keeps_its_map(monkeypatch: pytest
     assert any(result.notice == f"{NOT_REVISITED}: a curve was taken back" for result in results)
 
 
-def test_a_batch_has_all_revisits_so_far_some_metres_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked, record = list[int](), DriveRecord.lap
+@cache
+def sent() -> tuple[FixedLagMapper, list[OpenLap]]:
+    """Return the mapper after the drive, and what its batches got."""
+    laps, record = list[OpenLap](), DriveRecord.lap
 
     def lap(self: DriveRecord, *arguments: Any, **options: Any) -> OpenLap:
-        made = record(self, *arguments, **options)
-        asked.append(len(made.revisits))
-        return made
+        laps.append(record(self, *arguments, **options))
+        return laps[-1]
 
-    monkeypatch.setattr(DriveRecord, "lap", lap)
-    mapper, _ = map_log(drive())
-    assert asked[: len(mapper.revisits)] == [*range(1, len(mapper.revisits) + 1)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(DriveRecord, "lap", lap)
+        mapper, _ = map_log(drive())
+    return mapper, laps
+
+
+def test_a_batch_has_all_revisits_so_far_some_metres_apart() -> None:
+    mapper, laps = sent()
+    count = len(mapper.revisits)
+    assert [len(lap.revisits) for lap in laps[:count]] == [*range(1, count + 1)]
     driven = path_lengths(true_poses(drive()))[[one.later for one in mapper.revisits]]
     assert np.diff(driven).min() > REVISIT_INTERVAL - 1.0
+
+
+@pytest.mark.parametrize("gaps", [0, 1, -1])
+def test_a_revisit_that_is_off_by_a_gap_of_cones_is_refused(gaps: int) -> None:
+    """No closed curve speaks against it: it contradicts the odometry, and the revisits before it."""
+    _, laps = sent()
+    for lap in laps[:2]:
+        newest, *earlier = lap.revisits
+        moved = replace(newest, local=newest.local + np.array([4.0 * gaps, 0.0, 0.0]))
+        solved = solve_lap(replace(lap, revisits=(moved, *earlier)))
+        assert ("sigmas from the odometry" in solved.objection) == (gaps != 0)
+
+
+def test_a_marginal_leaves_the_slide_of_an_open_end_to_the_window() -> None:
+    """Hardly anything is known of it: growth places the last control points again."""
+    for one in replaced():
+        covariance, at = np.linalg.inv(one.marginal.information), len(one.marginal.calibration)
+        for spline in one.marginal.splines.values():
+            at += 2 * spline.size
+            along = spline.tangent_unit(np.array(spline.domain[1:]))[0]
+            assert along @ covariance[at - 2 : at, at - 2 : at] @ along > 5.0**2
 
 
 def test_the_batch_takes_them_from_the_online_run() -> None:
