@@ -153,11 +153,6 @@ class MeasuredNoise:
         """Noise of a twist."""
         return TwistNoise(self.odometry, self.drift)
 
-    @property
-    def twist_sigma(self) -> Array:
-        """White noise (3,) of a twist with the same effect as white noise and slow part together."""
-        return np.asarray(np.hypot(self.odometry, self.drift / np.sqrt(self.interval)))
-
     @cached_property
     def _inflations(self) -> Array:
         known = [one for one in (self.along, self.across) if one is not None]

@@ -121,8 +121,10 @@ def with_measured_noise(log: Log, parts: int = 1) -> Log:
         return log
     white = measured.odometry * np.sqrt(parts)
     measured = scaled(replace(measured, odometry=white, interval=measured.interval / parts), log.scale)
-    sigma = log.odometry_sigma if log.odometry_stated else measured.twist_sigma
-    log = replace(log, measured=measured, odometry_sigma=sigma)
+    log = replace(log, measured=measured)
+    if not log.odometry_stated:
+        sigma = np.maximum(measured.odometry, 1e-6)  # a vy that is always 0 has none, and a header wants some
+        log = replace(log, odometry_sigma=sigma, odometry_drift=measured.drift)
     if log.detections_stated:
         return log
     known = ((cycle, measured.covariances(cycle.points_vehicle, inflated=False)) for cycle in log.cycles)

@@ -235,7 +235,8 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     odometry = interpolated(rows[:, 1], rows[:, 2:], record.parts)
     if record.parts > 1:
         slow = rate(len(rows), float(np.ptp(rows[:, 1])))
-        told = f"odometry samples at {slow} were interpolated, {record.parts} for one"
+        hardly = ", and hardly show the bends" * (record.parts >= 10)  # half a second apart
+        told = f"odometry samples at {slow} were interpolated, {record.parts} for one{hardly}"
         notes[f"{told} (--held takes each as in force until the next)"] += len(rows)
     if record.imu is not None:
         odometry = Odometry(*with_yaw_rate(odometry.t, odometry.twist, *record.imu))

@@ -105,16 +105,16 @@ def hints(log: Log) -> list[Hint]:
     t, stamps = log.odometry.t, [cycle.t for cycle in log.cycles] or [float(log.odometry.t[0])]
     if stamps[0] > t[-1] or stamps[-1] < t[0]:
         return [*found, hint_of("two clocks", begin=stamps[0], end=stamps[-1], first=t[0], last=t[-1])]
-    log = log.at_scale_one()
+    log = with_usual_noise(log.at_scale_one())
     of_cycles = gaps_and_reach(log)
     log, of_positions = positions_in_metres(log)
     log, of_rows = possible_rows(log)
     stay = log.sensor.kind != "line" and not is_line(log)
     with threadpool_limits(limits=1):
         found += of_positions + of_rows + (camera(log) or motion_hints(log))
-        found = found or kind_hints(log)
-        if not found and stay:
-            found = one_label(log) + side_hints(log)
+        found = found or side_hints(log) or kind_hints(log)
+        if stay:
+            found = found or one_label(log)
     if not found:
         found += _odometry_hints(log) if log.odometry_stated else []
         found += _detection_hints(log) if log.detections_stated and stay else []
@@ -157,6 +157,20 @@ def stamps_in_seconds(log: Log) -> tuple[Log, list[Hint]]:
     odometry = replace(log.odometry, t=log.odometry.t * sizes[ODOMETRY_FILE])
     cycles = tuple(replace(cycle, t=cycle.t * sizes[DETECTIONS_FILE]) for cycle in log.cycles)
     return replace(log, odometry=odometry, cycles=cycles), found
+
+
+def with_usual_noise(log: Log) -> Log:
+    """The log with at most a usual noise of detections: measured by wrong odometry, it is larger."""
+    noise = log.measured
+    if log.detections_stated or noise is None or noise.along is None or noise.across is None:
+        return log
+    along, across = (
+        replace(one, sigma=np.minimum(one.sigma, most))
+        for one, most in ((noise.along, (0.2, 0.1)), (noise.across, (0.2, 0.05)))  # at 0 m and per m
+    )
+    usual = replace(noise, along=along, across=across)
+    known = ((cycle, usual.covariances(cycle.points_vehicle, inflated=False)) for cycle in log.cycles)
+    return replace(log, cycles=tuple(replace(cycle, covariances=C) for cycle, C in known if C is not None))
 
 
 def gaps_and_reach(log: Log) -> list[Hint]:
@@ -262,7 +276,7 @@ TURN_TOLD: Final = 8.5  # least yaw of the sensor that is told (degrees)
 FLAT: Final = 0.2  # largest size of a missing rate, by what the cones show
 UNEXPLAINED: Final = 30.0, 0.2  # largest share of pairs that show a motion (%), and its explained degree
 WELL_EXPLAINED: Final = 0.5  # least explained share for a small turn and a place, and for another drive
-SIDES: Final = 2000, 300  # approximate number of cycles of a side in use, and least number of motions
+SIDES: Final = 2000, 100  # approximate number of cycles of a side in use, and least number of motions
 FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation (degrees) and whether mirrored
     (180, False): ("the sensor's frame has x to the rear and y to the right", "-x", "-y"),
     (-90, False): ("the sensor's frame has x to the right and y ahead", "y", "-x"),
@@ -307,8 +321,9 @@ def motion_hints(log: Log) -> list[Hint]:
     if unexplained and not lines and explained.both.mean() < UNEXPLAINED[1]:
         return unexplained
     add_hint(told, why.get("content"), "pose" if fit.content == "pose" else "fixed frame")
-    when, before, after, jumping = regression.jump(fit)
-    if jump := far_better(jumping, np.maximum(explained.both, rest.both)):
+    when, before, after, jumping, constant = regression.jump(fit)
+    jump = far_better(jumping, np.maximum(explained.both, rest.both))
+    if jump and far_better(jumping, constant):
         add_hint(told, jump, "clock jumps", seconds=after - before, when=when)
     else:
         late = why.get("lag") if abs(fit.lag) > 0.2 else None  # less (s) is left to the calibration
@@ -406,15 +421,22 @@ def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log) -> None:
 
 
 def side_hints(log: Log) -> list[Hint]:
-    """Hint if the motions that cones on the left and on the right show disagree in time."""
+    """Hint if the motions that cones on the left and on the right show disagree in time.
+
+    The sides are those of the vehicle, as of two cameras; in a bend a left cone may be on the right.
+    """
     lags, (most, least) = [], SIDES
-    for side in (LEFT, RIGHT):
-        cycles = tuple(cycle.where(cycle.labels == side) for cycle in log.cycles)
+    for side in (1.0, -1.0):
+        cycles = tuple(cycle.where(side * cycle.points_vehicle[:, 1] > 0.0) for cycle in log.cycles)
         motions = motions_of(replace(log, cycles=cycles), most, MIN_MATCHED, fastest=0.0)
         if len(motions.rate) < least:
             return []
         regression = Regression(log.odometry, motions)
-        lags.append(regression.lag(regression.fit("twist", 0.0)))
+        fit = regression.fit("twist", 0.0)
+        lag, sigma = regression.lag(fit)
+        if regression.explained(replace(fit, lag=lag)).both.mean() < 0.4:  # of points of lines it is 0.3
+            return []
+        lags.append((lag, sigma))
     apart, sigma = lags[0][0] - lags[1][0], hypot(lags[0][1], lags[1][1])
     if abs(apart) < max(0.015, 4.0 * sigma):
         return []

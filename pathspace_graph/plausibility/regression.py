@@ -294,15 +294,25 @@ class Regression:
             total += float(np.clip(scores.sum() / curvature, -LAG_STEP, LAG_STEP))
         return total, float(np.linalg.norm(in_blocks(scores))) / curvature
 
-    def jump(self, fit: Fit) -> tuple[float, float, float, Array]:
-        """When the lag jumps, if it does (s), both lags (s), and the explained shares (P,)."""
-        shares = np.stack([self.explained(replace(fit, lag=lag)).both for lag in LAGS])
-        sums = shares.cumsum(axis=1)
-        rest = sums[:, -1:] - sums
-        k = int((sums.max(axis=0) + rest.max(axis=0)).argmax())
-        before, after = int(sums[:, k].argmax()), int(rest[:, k].argmax())
-        explained = np.append(shares[before, : k + 1], shares[after, k + 1 :])
-        return float(self.motions.end[k]), LAGS[before], LAGS[after], explained
+    def jump(self, fit: Fit) -> tuple[float, float, float, Array, Array]:
+        """When the lag jumps, the lags before and after (s), and the shares (P,) that are explained.
+
+        The last shares are those by one of both lags alone, the better one.
+        """
+        lags = LAGS
+        for _ in range(2):  # first among all lags, then near the two
+            shares = np.stack([self.explained(replace(fit, lag=lag)).both for lag in lags])
+            sums = shares.cumsum(axis=1)
+            rest = sums[:, -1:] - sums
+            k = int((sums.max(axis=0) + rest.max(axis=0)).argmax())
+            first, second = int(sums[:, k].argmax()), int(rest[:, k].argmax())
+            when, before, after = float(self.motions.end[k]), lags[first], lags[second]
+            jumping = np.append(shares[first, : k + 1], shares[second, k + 1 :])
+            constant = shares[max(first, second, key=lambda lag: sums[lag, -1])]
+            lags = sorted(
+                {lag + off for lag in (before, after) for off in np.linspace(-0.25, 0.25, 11).tolist()}
+            )
+        return when, before, after, jumping, constant
 
     def around(self) -> tuple[Complex, Array]:
         """Medians (P,) of successive motions, which explain what the cones show."""

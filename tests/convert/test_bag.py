@@ -136,7 +136,8 @@ def test_a_drive_comes_back_from_a_bag(kind: Kind, drive: Log, tmp_path: Path) -
     assert_same_readings(log, drive)
     assert log.detections_stated and not log.odometry_stated
     assert log.measured is not None
-    np.testing.assert_array_equal(log.odometry_sigma, log.measured.twist_sigma)
+    np.testing.assert_array_equal(log.noise.twist.white, log.measured.odometry)
+    np.testing.assert_array_equal(log.noise.twist.drift, log.measured.drift)
     assert log.source["odometry"] == "/odom (nav_msgs/msg/Odometry)"
 
 
@@ -156,7 +157,8 @@ def test_noise_that_is_not_stated_is_measured_and_the_log_says_so(long_drive: Lo
     assert '[noise]\nodometry = "measured"\ndetections = "measured"\n' in header
     assert not log.odometry_stated and not log.detections_stated
     assert log.measured is not None and log.measured.along is not None
-    np.testing.assert_array_equal(log.odometry_sigma, log.measured.twist_sigma)
+    np.testing.assert_array_equal(log.noise.twist.white, log.measured.odometry)
+    np.testing.assert_array_equal(log.noise.twist.drift, log.measured.drift)
     for cycle in log.cycles:
         expected = log.measured.covariances(cycle.points_vehicle, inflated=False)
         assert expected is not None

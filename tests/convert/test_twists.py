@@ -341,8 +341,11 @@ def test_slow_twists_are_interpolated_unless_they_are_held(
     rows = table(drive(), 10)
     source = write(tmp_path, drive(), rows)
     log = read_log(convert(source))
-    assert "odometry samples at 5" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "odometry samples at 5" in said and "hardly show the bends" not in said
     assert len(log.odometry.t) == 4 * len(rows) - 3
+    convert(write(tmp_path / "rare", drive(), rows[::3]))
+    assert "odometry samples at 1" in (said := capsys.readouterr().out) and "hardly show the bends" in said
     held = read_log(convert(source, "--held"))
     np.testing.assert_allclose(held.odometry.twist, rows[:, 1:])
 

@@ -16,7 +16,7 @@ import numpy as np
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Detections, Log
-from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.labels import LEFT
 from pathspace_graph.sim.vehicle import integrate
 
 DEGREE: Final = float(np.pi / 180.0)  # a degree in radians
@@ -108,11 +108,11 @@ def late(log: Log, seconds: float, begin: float = -np.inf) -> Log:
 
 
 def side_late(log: Log, seconds: float) -> Log:
-    """Stamp the cones of the right too late (s), in cycles of their own."""
+    """Stamp the cones on the right of the vehicle too late (s), in cycles of their own."""
     halves = [
-        cycle.where(cycle.labels == RIGHT) if side else cycle.where(cycle.labels != RIGHT)
-        for side in (False, True)
-        for cycle in (late(log, seconds) if side else log).cycles
+        cycle.where((cycle.points_vehicle[:, 1] < 0.0) == is_right)
+        for is_right in (False, True)
+        for cycle in (late(log, seconds) if is_right else log).cycles
     ]
     cycles = sorted((half for half in halves if len(half.labels)), key=lambda half: half.t)
     return replace(log, cycles=tuple(cycles), truth=None)

@@ -8,14 +8,18 @@ import numpy as np
 import pytest
 
 from pathspace_graph import hints
+from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
+from pathspace_graph.io.overrides import override
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.plausibility.judge import positions_in_metres
+from pathspace_graph.sim.simulate import preset, simulate
+from pathspace_graph.sim.track_generator import generate_track
 
 from ..scenes.drives import ahead, corridor, detections, exact_log, short_drive
 from ..scenes.lines import line_drive
 from .good_logs import EDITED, PRESET, SIMULATED, good_log
-from .mistakes import MISTAKES, causes_of, in_frame, late, with_points, with_twists
+from .mistakes import MISTAKES, causes_of, in_frame, late, side_late, with_cycles, with_points, with_twists
 
 SAID = {
     "positions in millimetres": ("in millimetres", "multiply x and y by 0.001"),
@@ -280,3 +284,33 @@ def test_the_unit_of_the_positions_is_told_of_lines_as_well() -> None:
     """Nothing about it needs cones that stay."""
     found = hints(MISTAKES["positions in millimetres"](line_drive(1, 1.0)))
     assert [hint.cause for hint in found] == ["positions"]
+
+
+@pytest.mark.parametrize(
+    "mistake", ["speeds in the map frame, start at 137 degrees", "sensor frame: x to the rear"]
+)
+def test_a_noise_that_was_measured_by_wrong_odometry_hides_no_mistake(mistake: str) -> None:
+    """It is as large as that of a drive whose cones seemed to be points of a line."""
+    large = RayNoise(np.array([0.7, 0.08])), RayNoise(np.array([0.9, 0.11]))
+    noise = MeasuredNoise(np.full(3, 0.01), np.zeros(3), 0.025, *large)
+    log = with_cycles(
+        MISTAKES[mistake](short_drive()),
+        lambda cycle: {"covariances": noise.covariances(cycle.points_vehicle, inflated=False)},
+    )
+    found = hints(replace(log, odometry_stated=False, detections_stated=False, measured=noise))
+    assert [hint.cause for hint in found] == [*causes_of(mistake)]
+
+
+def test_a_small_step_of_the_clock_is_told_by_its_size() -> None:
+    log = short_drive()
+    (found,) = hints(late(log, 0.3, float(log.odometry.t.mean())))
+    assert "the clock of one file jumps or drifts, by 0.3 s about" in found.likely
+
+
+def test_two_cameras_that_disagree_in_time_are_no_sensor_of_lines() -> None:
+    """At five cycles a second and with their noise, a lap's cones are not met where they were."""
+    settings = override(preset({"sensor": "camera"}), {"laps": 1}, "")
+    log = side_late(simulate(generate_track(np.random.default_rng(1)), settings, 1), 0.05)
+    (found,) = hints(log)
+    assert found.cause == "sides"
+    assert 35.0 < float(found.likely.split("by ")[1].split(" ms")[0]) < 65.0

@@ -145,10 +145,11 @@ def test_a_jump_of_the_lag_is_found_and_none_where_there_is_none() -> None:
     velocity, rate = np.where(first, early.velocity, late_.velocity), np.where(first, early.rate, late_.rate)
     regression = Regression(ODOMETRY, replace(early, velocity=velocity, rate=rate))
     fit, _ = regression.best()
-    when, before, after, shares = regression.jump(fit)
+    when, before, after, shares, constant = regression.jump(fit)
     assert (before, after) == (0.0, 1.0)
     assert when == pytest.approx(20.0, abs=0.5)
     assert far_better(shares, regression.explained(fit).both) is not None
+    assert far_better(shares, constant) is not None
     good = moved(Fit(), noise=0.2)
     assert far_better(good.jump(Fit())[3], good.explained(Fit()).both) is None
 
