@@ -16,7 +16,7 @@ from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary
+from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary, open_boundary
 
 SIGMAS_CALIBRATIONS: Final = (0.05, 0.02, 0.03, 0.1, 0.05, 0.05, 0.2)
 """Prior standard deviations of the calibrations on a known map, where all are observable: odometry's scale
@@ -42,8 +42,10 @@ def swap_in(road: Road, marginal: LapMarginal) -> Array:
     before = state.poses[-1].copy()
     if marginal.closed:
         removed = state.map_keys
-        for label, spline in marginal.splines.items():
-            state.close(label, state.boundaries[label].closed(spline.knots))
+        settings = road.settings.spline, road.settings.gauge
+        for label, spline in marginal.splines.items():  # a batch may have found a side that the road has not
+            boundary = state.boundaries.get(label, open_boundary(*settings))
+            state.close(label, boundary.closed(spline.knots))
         added = np.concatenate([state.keys(label) for label in marginal.splines])
         points = np.concatenate([spline.distinct_control_points for spline in marginal.splines.values()])
         restart(smoother, first, removed, added, points)

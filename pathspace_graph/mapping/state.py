@@ -227,7 +227,7 @@ class State:
 
     def close(self, label: int, boundary: Boundary) -> None:
         """Replace an open boundary by a periodic one; the smoother inserts its control points."""
-        self.boundaries[label] = boundary
+        self.boundaries = dict(sorted({**self.boundaries, label: boundary}.items()))
 
     def replace_curves(self, boundaries: Mapping[int, Boundary]) -> None:
         """Replace all boundaries; the smoother inserts their control points."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from pathspace_graph.graph.rows import revisit_rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log
 from pathspace_graph.loop import drive as drive_module
+from pathspace_graph.loop import open as open_road
 from pathspace_graph.loop.drive import Drive, DriveRecord, Step
 from pathspace_graph.loop.lap_solver import Outcome
 from pathspace_graph.loop.open import NOT_REVISITED, Open, Revisits, earlier_pass
@@ -76,6 +78,22 @@ def test_an_opposite_pass_whose_ways_part_is_none() -> None:
     assert earlier_pass(passes) is None
     passes[-1, 2] = 0.0
     assert earlier_pass(passes) == pytest.approx(70, abs=1)
+
+
+def test_a_found_revisit_rests_the_search_for_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Attempts are 3 m apart, and 15 m after one that has found something."""
+    found, tried = SimpleNamespace(), list[float]()
+    smoother = SimpleNamespace(first_cycle=9, variables=SimpleNamespace(sensor=np.zeros(0)))
+    road = SimpleNamespace(path=SimpleNamespace(length=0.0), smoother=smoother)
+    record = SimpleNamespace(with_window=lambda _: np.zeros((20, 3)), seen_in=lambda *_: None)
+    monkeypatch.setattr(open_road, "earlier_pass", lambda _: tried.append(road.path.length) or 3)
+    monkeypatch.setattr(open_road, "newest_place", lambda *_: found if road.path.length > 40.0 else None)
+    monkeypatch.setattr(open_road, "revisit_of", lambda *_: found)
+    search = Revisits(MapperSettings())
+    for length in np.arange(0.0, 70.0, 0.5).tolist():
+        road.path.length = length
+        search.find(road, record, None)  # type: ignore[arg-type]
+    assert tried == [30.0, 33.0, 36.0, 39.0, 42.0, 57.0]
 
 
 # --- the drive of a skidpad ------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
+from pathspace_graph.spline.boundary import open_boundary
 
 from ..scenes.maps import boundary_through
 
@@ -124,3 +125,13 @@ def test_the_extrapolated_end_is_no_part_of_a_stretch(state: State) -> None:
     points, curve, low = np.array([[20.0, -2.0], [99.0, -2.0]]), np.array([1, 1]), np.zeros(2)
     foot = state.curves.find(state.map_points, points, curve, low, np.array([20.0, 99.0]))
     np.testing.assert_allclose(foot.u, [20.0, trusted], atol=1e-9)
+
+
+def test_a_side_that_only_a_batch_has_found_closes_as_well() -> None:
+    """Curves stay in the order of their labels, as their control points are."""
+    settings, state = MapperSettings(), State()
+    knots = np.arange(-3.0, 14.0)
+    for label in (RIGHT, LEFT):
+        state.close(label, open_boundary(settings.spline, settings.gauge).closed(knots))
+    assert [*state.boundaries] == [LEFT, RIGHT]
+    assert state.closed
