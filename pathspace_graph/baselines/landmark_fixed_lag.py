@@ -52,7 +52,7 @@ class LandmarkFixedLag(OnlineBaseline):
     of a curve.
     """
 
-    READS: ClassVar = (*FRONT_END, "lag", "max_poses", "relinearize", "steps", "steps_grown")
+    READS: ClassVar = (*FRONT_END, "lag", "max_poses", "open_lap", "relinearize", "steps", "steps_grown")
 
     def _begin(self) -> None:
         self.smoother = FixedLagSmoother(motions.smoother_settings(self.settings), LandmarkMap(self.settings))
@@ -176,7 +176,7 @@ class LandmarkFixedLag(OnlineBaseline):
             self._merge(
                 *association.find_duplicates(state, len(state), self.smoother.last_covariance, self.settings)
             )
-        elif self._near_start():
+        elif self._near_start() and self.record.unsolvable is None:
             reach = self.settings.closing.radius_after(length)
             recent, old = state.positions(detected), np.flatnonzero(self._old())
             pairs = detect_loop(self.smoother, recent, old, reach)
