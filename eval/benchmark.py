@@ -133,15 +133,17 @@ def speed_on(log: Log, settings: MapperSettings) -> dict[str, float]:
     """Map a log online, and give each cycle to the rivals right afterwards; return the figures of `SPEED`.
 
     From closing until the map is replaced by one that was solved as a batch, the cycles come as they do in a
-    car, since another process solves meanwhile. What the run was too short for is absent.
+    car, since another process solves meanwhile. The rival solves its batch in the update that closes, which
+    does not count. What the run was too short for is absent.
     """
     mapper, told = FixedLagMapper(settings, log.noise), ToldLandmarks(log)
     rival, cycles = make_online(RIVAL, settings, log), split_odometry(log)
     ours, rivals, isam2, at = list[float](), list[float](), list[float](), dict[str, int]()
+    rival_closed = False
     interval, closed_at = log.cycles[-1].t / len(log.cycles), math.inf
 
     def observe(cycle: ObservedCycle) -> None:
-        nonlocal closed_at
+        nonlocal closed_at, rival_closed
         ours.append(1e3 * cycle.processor)
         if cycle.result.closed and "closing" not in at:
             at["closing"], closed_at = len(ours) - 1, cycle.result.t
@@ -150,8 +152,10 @@ def speed_on(log: Log, settings: MapperSettings) -> dict[str, float]:
         # a batch of the lap, which is always shorter than the lag, may be under way in its own process
         if "swap" not in at and 0.0 <= cycle.result.t - closed_at < settings.lag:
             time.sleep(interval)
-        *_, seconds = timed_update(rival, *next(cycles))
-        rivals.append(1e3 * seconds)
+        theirs, _, seconds = timed_update(rival, *next(cycles))
+        if theirs.closed == rival_closed:
+            rivals.append(1e3 * seconds)
+        rival_closed = theirs.closed
         isam2.append(1e3 * told.advance())
         advance()
 
@@ -311,7 +315,10 @@ SLOPE: Final = [*POINT[:2], "slope", "error", "points", "low", "high", "stopped"
 
 @dataclass(eq=False)
 class Lane:
-    """An estimator that is to map a log, and what was measured, until the log ended or it was stopped."""
+    """An estimator that is to map a log, and what was measured, until the log ended or it was stopped.
+
+    The update that closes a loop does not count: some solve their batch in it, others in another process.
+    """
 
     estimator: str
     part: Part
@@ -321,7 +328,7 @@ class Lane:
 
     def updates(self, settings: MapperSettings, budget: float) -> Iterator[None]:
         """Do an update at each step, until the log ends or the lane is stopped."""
-        estimator = make_online(self.estimator, settings, self.part.log)
+        estimator, closed = make_online(self.estimator, settings, self.part.log), False
         for odometry, detections in split_odometry(self.part.log):
             try:
                 timed_wait(estimator)
@@ -329,7 +336,8 @@ class Lane:
             except Exception as error:  # the table reports any failure
                 self.stopped = " ".join(f"{type(error).__name__}: {error}".split())
                 return
-            self.seconds.append(seconds)
+            self.seconds.append(seconds if estimate.closed == closed else np.nan)
+            closed = estimate.closed
             self.sizes.append(sum(estimate.sizes))
             if len(self.seconds) >= JUDGED and np.mean(self.seconds[-JUDGED:]) > budget:
                 self.stopped = f"over {budget:g} s an update"
