@@ -45,8 +45,8 @@ from .start import StartMap, aligned_odometry, start_odometry
 from .system import BatchSystem, Evaluation, curve_gauge
 
 FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, tolerance=10.0)  # limited, to finish in time
-OPEN_SLIDE: Final = 10.0  # weak prior on the slide of an open curve's control points (m): online has one, too
 FROM_ODOMETRY: Final = Effort(rounds=24, tolerance=10.0)
+OPEN_SLIDE: Final = 10.0  # weak prior on the slide of an open curve's control points (m): online has one, too
 
 
 @dataclass(frozen=True, eq=False)
