@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 from pathspace_graph.batch.association import POSE_STEP, headings, locate_poses
 from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import LapMarginal
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import compose, inverse, left_of, move_points, relative
 from pathspace_graph.graph.smoother import exchange_calibration_priors, hold_motion, restart, set_prior
 from pathspace_graph.graph.variables import NO_KEYS, control_keys, pose_keys
@@ -27,54 +27,57 @@ FIRST_REACH: Final = 20.0  # search range of foot points about that place (m alo
 SIGMA_STEP: Final = 10.0  # damping of control points while the loop is optimized (m)
 
 
-# --- the marginal of the open lap's batch ----------------------------------------------------------------
+# --- the marginal of a batch -----------------------------------------------------------------------------
 
 
 def swap_in(road: Road, marginal: LapMarginal) -> Array:
-    """Replace curves and prior by the marginal of a batch; return the jump (3,) of the newest pose.
+    """Replace curves and prior by the marginal of a lap; return the jump (3,) of the newest pose.
 
     The window keeps its own factors of the poses from `first_kept` on, and the marginal has those of all
-    earlier poses, so nothing is counted twice. The marginal includes the priors of spacing and shape. What
-    came after the batch's last pose moves rigidly with it: poses, and the newest ends of open curves.
+    earlier poses, so nothing is counted twice. The marginal includes the priors of spacing and shape.
     """
-    smoother, state, first = road.smoother, road.smoother.map.state, marginal.first_kept
+    smoother, state = road.smoother, road.smoother.map.state
+    smoother.reactivate(with_prior=False)
+    before, removed = state.poses[-1].copy(), state.map_keys
+    settings = road.settings.spline, road.settings.gauge
+    for label, spline in marginal.splines.items():  # a batch may have found a side that the road has not
+        boundary = state.boundaries.get(label, open_boundary(*settings))
+        state.close(label, boundary.closed(spline.knots))
+    added = np.concatenate([state.keys(label) for label in marginal.splines])
+    points = np.concatenate([spline.distinct_control_points for spline in marginal.splines.values()])
+    restart(smoother, marginal.first_kept, removed, added, points)
+    smoother.map.replaced_by(marginal.scatter, marginal.cones, marginal.stations)
+    _move_poses(state.poses, marginal.poses[marginal.first_kept :])
+    locate_poses(state)
+    _take_prior(smoother, marginal, added)
+    smoother.reassociate()
+    return _jump(road, before)
+
+
+def lay_on(road: Road, marginal: LapMarginal) -> Array:
+    """Move an open map to the marginal of its batch, the new prior; return the jump (3,) of the newest pose.
+
+    The curves keep their knots and go on to grow. What came after the batch's last pose moves rigidly with
+    it: poses, tentative cones, and the newest ends of the curves.
+    """
+    smoother, state = road.smoother, road.smoother.map.state
     smoother.reactivate(with_prior=False)
     before = state.poses[-1].copy()
-    if marginal.closed:
-        removed = state.map_keys
-        settings = road.settings.spline, road.settings.gauge
-        for label, spline in marginal.splines.items():  # a batch may have found a side that the road has not
-            boundary = state.boundaries.get(label, open_boundary(*settings))
-            state.close(label, boundary.closed(spline.knots))
-        added = np.concatenate([state.keys(label) for label in marginal.splines])
-        points = np.concatenate([spline.distinct_control_points for spline in marginal.splines.values()])
-        restart(smoother, first, removed, added, points)
-        smoother.map.replaced_by(marginal.scatter, marginal.cones, marginal.stations)
-    else:
-        restart(smoother, first, NO_KEYS, NO_KEYS, np.zeros((0, 2)))
-    _move_poses(state.poses, marginal.poses[first:])
+    restart(smoother, marginal.first_kept, NO_KEYS, NO_KEYS, np.zeros((0, 2)))
+    _move_poses(state.poses, marginal.poses[marginal.first_kept :])
     motion = compose(state.poses[-1], inverse(before))
-    if not marginal.closed:
-        road.move(motion)
-        for label, spline in marginal.splines.items():
-            control_points, boundary = state.control_points(label), state.boundaries[label]
-            end, placed = marginal.ends[label], spline.size
-            if boundary.confirmed_end > end:  # growth has placed the last ones again
-                placed = boundary.settled(spline.size, boundary.last_cone(end))
-            control_points[placed:] = move_points(motion, control_points[placed:])
-            control_points[:placed] = spline.control_points[:placed]
+    road.move(motion)
+    for label, spline in marginal.splines.items():
+        control_points, boundary = state.control_points(label), state.boundaries[label]
+        end, placed = marginal.ends[label], spline.size
+        if boundary.confirmed_end > end:  # growth has placed the last ones again
+            placed = boundary.settled(spline.size, boundary.last_cone(end))
+        control_points[placed:] = move_points(motion, control_points[placed:])
+        control_points[:placed] = spline.control_points[:placed]
     known = [state.keys(label)[: spline.size] for label, spline in marginal.splines.items()]
-    state.variables.calibrations[:] = marginal.calibration
-    keys = np.concatenate([state.variables.calibration_keys, *known, pose_keys(np.array([first]))])
-    set_prior(smoother, keys, marginal.mean, marginal.information)
-    if marginal.closed:
-        locate_poses(state)
-        smoother.reassociate()
-    else:
-        exchange_calibration_priors(smoother, marginal.calibration_prior)
-    for _ in range(road.settings.closing.iterations):
-        smoother.step(SIGMA_STEP)
-    return np.asarray(state.poses[-1] - before)
+    _take_prior(smoother, marginal, np.concatenate(known))
+    exchange_calibration_priors(smoother, marginal.calibration_prior)
+    return _jump(road, before)
 
 
 def _move_poses(poses: Array, solved: Array) -> None:
@@ -83,6 +86,22 @@ def _move_poses(poses: Array, solved: Array) -> None:
     for pose in poses[len(solved) :]:
         pose[:] = compose(solved[-1], relative(last, pose))
     poses[: len(solved)] = solved
+
+
+def _take_prior(smoother: CurveSmoother, marginal: LapMarginal, known: IntArray) -> None:
+    """Take the calibration and the prior of a marginal, whose control points have the keys `known` (k,)."""
+    variables = smoother.variables
+    variables.calibrations[:] = marginal.calibration
+    oldest = pose_keys(np.array([marginal.first_kept]))
+    keys = np.concatenate([variables.calibration_keys, known, oldest])
+    set_prior(smoother, keys, marginal.mean, marginal.information)
+
+
+def _jump(road: Road, before: Array) -> Array:
+    """Take the steps after a replacement; return the jump (3,) of the newest pose from that before."""
+    for _ in range(road.settings.closing.iterations):
+        road.smoother.step(SIGMA_STEP)
+    return np.asarray(road.poses[-1] - before)
 
 
 # --- a known map ----------------------------------------------------------------------------------------
@@ -116,9 +135,7 @@ def lay_on_known(road: Road, known: KnownMap, motion: Array, covariance: Array) 
     information = block_diag(*map(np.linalg.inv, known_of))
     set_prior(smoother, keys, mean, information)
     smoother.reassociate()
-    for _ in range(road.settings.closing.iterations):
-        smoother.step(SIGMA_STEP)
-    return np.asarray(state.poses[-1] - before)
+    return _jump(road, before)
 
 
 def _locate_first(state: State) -> None:

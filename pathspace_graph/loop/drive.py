@@ -28,7 +28,7 @@ from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.places.passes import SeenIn
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .closing import lay_on_known, swap_in
+from .closing import lay_on, lay_on_known, swap_in
 from .known_loop import evidence_of
 from .lap_solver import LapSolver, Outcome
 
@@ -228,14 +228,16 @@ class Drive(Copyable):
         self.closed_by = returned_by
         return self.swap_in(road, solved)
 
-    def lay_on(self, road: Road, solved: LapMarginal, revisit: Revisit) -> Array:
-        """Replace an open map by the batch of a revisit; return the jump (3,)."""
-        self.revisits = (*self.revisits, revisit)
-        return self.swap_in(road, solved)
-
     def swap_in(self, road: Road, solved: LapMarginal) -> Array:
-        """Replace map and prior of a road by those of a batch; return the jump (3,) of the newest pose."""
-        jump = swap_in(road, solved)
+        """Replace map and prior of a road by those of a lap; return the jump (3,) of the newest pose."""
+        return self._replaced(road, solved, swap_in(road, solved))
+
+    def lay_on(self, road: Road, solved: LapMarginal, revisit: Revisit) -> Array:
+        """Move an open map to the batch of a revisit; return the jump (3,) of the newest pose."""
+        self.revisits = (*self.revisits, revisit)
+        return self._replaced(road, solved, lay_on(road, solved))
+
+    def _replaced(self, road: Road, solved: LapMarginal, jump: Array) -> Array:
         self.lap_seconds = solved.seconds
         self.record.replaced(np.concatenate([solved.poses[: solved.first_kept], road.poses]))
         road.place_orange(self.record.corrected)

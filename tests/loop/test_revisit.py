@@ -152,10 +152,10 @@ class Replaced:
 @cache
 def replaced() -> list[Replaced]:
     """Return the replacements of a drive, without the steps that follow each."""
-    found, take = list[Replaced](), drive_module.swap_in
+    found, take = list[Replaced](), drive_module.lay_on
     """The priors of the calibrations have changed since each batch began."""
 
-    def swap_in(road: Road, marginal: LapMarginal) -> Array:
+    def lay_on(road: Road, marginal: LapMarginal) -> Array:
         before, after = road.copy(), road.copy()
         before.smoother.transform_to_origin()
         mean, sigma = after.smoother.calibration_prior
@@ -166,7 +166,7 @@ def replaced() -> list[Replaced]:
         return take(road, marginal)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drive_module, "swap_in", swap_in)
+        patch.setattr(drive_module, "lay_on", lay_on)
         map_log(drive())
     assert len(found) >= 3
     return found
