@@ -71,7 +71,8 @@ class LandmarkFixedLag(OnlineBaseline):
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
         motion, detections = reading.motion, reading.detections
-        self.record.measured(reading)
+        if not self.closed:
+            self.record.measured(reading)
         predict(self.smoother, self.path, motion, detections.t)
         watch.lap("predict")
         new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.odometry.twist)
@@ -89,12 +90,8 @@ class LandmarkFixedLag(OnlineBaseline):
 
     def _marginalize(self) -> None:
         smoother, table = self.smoother, self.smoother.map.detections
-        first, poses, cycle, landmark = (
-            smoother.first_cycle,
-            smoother.variables.poses,
-            table.cycle,
-            table.landmark,
-        )
+        first, poses = smoother.first_cycle, smoother.variables.poses
+        cycle, landmark = table.cycle, table.landmark
         smoother.marginalize()
         left = smoother.first_cycle - first
         if left:

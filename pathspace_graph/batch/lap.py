@@ -97,7 +97,6 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
     begin = time.perf_counter()
     with threadpool_limits(limits=1):
         system, at, convergence = lap_optimum(lap)
-        few, change = at.state, np.eye(at.state.map_points.size)
         prior = np.array(lap.settings.calibrations), np.array(lap.settings.sigmas_calibrations)
         scatter, cones, stations = dict[int, Array](), dict[int, Array](), dict[int, Array]()
         if at.state.closed:
@@ -107,6 +106,7 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             scatter = {label: simple.scatter.of_control_points(label, boundary) for label, boundary in curves}
             objection = evidence_against(system, at, few.splines, simple.detections)
         else:
+            few, change = at.state, np.eye(at.state.map_points.size)
             calibration, earlier = at.state.variables.calibration, lap.revisits[1:]
             objection = disagreement(system, at.state.poses, calibration, earlier)
         information, mean, dense = marginal_of(system, at, few, change, lap.first_kept)
