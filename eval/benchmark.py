@@ -6,26 +6,25 @@ slows all alike. All times but that of the batch are processor times of the thre
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from itertools import cycle as cycled
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+from itertools import cycle
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import gtsam
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, ScalarFormatter, StrMethodFormatter
-from numpy.random import Generator
 from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.console import progress
 from pathspace_graph.estimators import make_online
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import ray_sigmas
-from pathspace_graph.factors.se2 import compose, to_map
+from pathspace_graph.factors.se2 import compose, left_of, to_map
 from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.mapping.motion import integrate_odometry
@@ -33,38 +32,34 @@ from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import ObservedCycle, run_online, split_odometry, timed_update, timed_wait
 from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim.curves import along_polyline, arc_lengths, left_normals, unit
-from pathspace_graph.sim.lines import LINE, LineSettings
-from pathspace_graph.sim.sensor import SensorSettings
+from pathspace_graph.sim.sensor import LINE, LineSettings, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track import Track
-from pathspace_graph.sim.track_generator import generate_track
+from pathspace_graph.sim.track import Track, along_polyline, arc_lengths, unit
 from pathspace_graph.sim.vehicle import VehicleSettings
 
 from .experiment.provenance import code_of
-from .experiment.run import OnCell, rows_of
+from .experiment.run import rows_of
 from .experiment.tables import Table, write_csv
 from .figures import style
-from .figures.style import MARKERS, PALETTE, WIDTH
 from .metrics.accuracy import mean_of
-from .metrics.measures import figure, figures
+from .metrics.measures import UNKNOWN, Metric, figure, figures
 from .metrics.summary import lap_times, versions
 
 # --- beside ISAM2 ----------------------------------------------------------------------------------------
 
 RIVAL: Final = "landmark-fixed-lag"  # estimator that gets the same cycles in turn
 WARM_UP: Final = 50  # number of cycles after which the window is full, before which the means do not begin
-SPEED: Final = {  # figures of a drive: label, and digits
-    "mean_by_isam2": ("mean update relative to iSAM2 with known data association", 2),
-    "p99_by_isam2": ("99th percentile relative to that iSAM2", 2),
-    "mean_by_landmark": ("mean update relative to landmark-fixed-lag", 2),
-    "mean": ("mean update [ms]", 1),
-    "p99": ("99th percentile of an update [ms]", 1),
-    "closing": ("update that closes the loop [ms]", 1),
-    "swap": ("update that swaps the map [ms]", 1),
-    "slowest_other": ("slowest of all other updates [ms]", 1),
-    "solve": ("batch of the open lap, in its own process [s]", 1),
-}
+SPEED: Final = (  # of a drive
+    Metric("mean_by_isam2", "mean update relative to iSAM2 with known data association", digits=2),
+    Metric("p99_by_isam2", "99th percentile relative to that iSAM2", digits=2),
+    Metric("mean_by_landmark", "mean update relative to landmark-fixed-lag", digits=2),
+    Metric("mean", "mean update", "ms", 1),
+    Metric("p99", "99th percentile of an update", "ms", 1),
+    Metric("closing", "update that closes the loop", "ms", 1),
+    Metric("swap", "update that swaps the map", "ms", 1),
+    Metric("slowest_other", "slowest of all other updates", "ms", 1),
+    Metric("solve", "batch of the open lap, in its own process", "s", 1),
+)
 
 
 class ToldLandmarks:
@@ -81,7 +76,7 @@ class ToldLandmarks:
             raise ValueError("expected a simulated log, whose associations are known, found one without")
         self.isam = gtsam.ISAM2()
         self._cycles: Iterator[tuple[Odometry, Detections]] = split_odometry(log)
-        ends = np.cumsum([len(cycle.labels) for cycle in log.cycles])
+        ends = np.cumsum([len(seen.labels) for seen in log.cycles])
         self._cones: Iterator[IntArray] = iter(np.split(log.truth.associations, ends[:-1]))
         self._sigma = log.odometry_sigma
         self._pose: Array = np.zeros(3)
@@ -123,12 +118,6 @@ class ToldLandmarks:
         return seconds
 
 
-def speed_of_drive(seed: int, laps: int) -> dict[str, float]:
-    """Map a drive on a generated track, both of this seed; return the figures of `SPEED`."""
-    track = generate_track(np.random.default_rng(seed))
-    return speed_on(simulate(track, SimulationSettings(laps=laps), seed), MapperSettings())
-
-
 def speed_on(log: Log, settings: MapperSettings) -> dict[str, float]:
     """Map a log online, and give each cycle to the rivals right afterwards; return the figures of `SPEED`.
 
@@ -142,15 +131,15 @@ def speed_on(log: Log, settings: MapperSettings) -> dict[str, float]:
     rival_closed = False
     interval, closed_at = log.cycles[-1].t / len(log.cycles), math.inf
 
-    def observe(cycle: ObservedCycle) -> None:
+    def observe(observed: ObservedCycle) -> None:
         nonlocal closed_at, rival_closed
-        ours.append(1e3 * cycle.processor)
-        if cycle.result.closed and "closing" not in at:
-            at["closing"], closed_at = len(ours) - 1, cycle.result.t
-        if cycle.record.jump is not None:
+        ours.append(1e3 * observed.processor)
+        if observed.result.closed and "closing" not in at:
+            at["closing"], closed_at = len(ours) - 1, observed.result.t
+        if observed.record.jump is not None:
             at["swap"] = len(ours) - 1
         # a batch of the lap, which is always shorter than the lag, may be under way in its own process
-        if "swap" not in at and 0.0 <= cycle.result.t - closed_at < settings.lag:
+        if "swap" not in at and 0.0 <= observed.result.t - closed_at < settings.lag:
             time.sleep(interval)
         theirs, _, seconds = timed_update(rival, *next(cycles))
         if theirs.closed == rival_closed:
@@ -170,8 +159,10 @@ def speed_on(log: Log, settings: MapperSettings) -> dict[str, float]:
     return found | ({"solve": mapper.lap_seconds} if "swap" in at else {})
 
 
-# --- drives of the sweeps --------------------------------------------------------------------------------
+# --- sweeps ----------------------------------------------------------------------------------------------
 
+CONES, READINGS, LAPS, DENSE_LINE = "cones", "readings", "laps", "line"
+"""Varied: cones seen, detections of an update, or lap. On a line, 300 points in each update."""
 GAP, DENSE_GAP, DENSE_RANGE = 5.0, 1.0, 30.0  # distances of cones in a row, and dense with its range (m)
 LINE_POINTS: Final = 300  # points of both lines in a cycle, in the mean
 LINE_SPACING: Final = 0.2  # distance of a cycle's points along each line, which gives that many (m)
@@ -181,6 +172,7 @@ DENT, DENTS = 0.12, 3  # share of the radius by which a closed road leaves its c
 DRIVEN, LATERAL = 20.0, 9.0  # speed of the vehicle (m/s) and its largest lateral acceleration (m/s^2)
 STEP: Final = 0.25  # distance of the samples of a road's middle (m)
 SPARE: Final = 1.1  # cones of an open road by those to be seen, since some are never detected
+JUDGED: Final = 10  # number of updates whose mean is compared with the budget
 QUICK: Final = ScalingSettings(  # takes less than a minute; its slopes mean little
     cones_max=200.0,
     bins=8,
@@ -192,59 +184,6 @@ QUICK: Final = ScalingSettings(  # takes less than a minute; its slopes mean lit
     laps_cones=60,
     budget=0.1,
 )
-CONES, READINGS, LAPS, DENSE_LINE = "cones", "readings", "laps", "line"
-"""Varied: cones seen, detections of an update, or lap. On a line, 300 points in each update."""
-
-
-class Part(NamedTuple):
-    """A log of a sweep."""
-
-    log: Log
-    at: Array  # (n,) abscissa of each cycle; NaN doesn't count
-    name: str = ""  # where a sweep has several
-
-
-@dataclass(frozen=True, eq=False)
-class Sweep:
-    """Logs that are driven in turn, and the intervals of the abscissa that become points."""
-
-    parts: Sequence[Part]
-    edges: Array
-    fit_from: float = 0.0  # abscissa at which the slope begins
-
-    @property
-    def cycles(self) -> int:
-        return max(len(part.log.cycles) for part in self.parts)
-
-
-def make_drives(settings: ScalingSettings) -> dict[str, Sweep]:
-    """Simulate the drives of all sweeps: a long road, a short dense one, and laps of a closed one."""
-    seed, rng = settings.seed, np.random.default_rng(settings.seed)
-    long = drive_log(open_road(int(settings.cones_max), GAP), seed)
-    seen = cones_seen(long)
-    count = int(np.searchsorted(seen, settings.cones_max)) + 1
-    low, high = np.log(settings.cones_min), np.log(settings.cones_max + 1.0)
-    until_seen = replace(long, cycles=long.cycles[:count], truth=None)
-    cones = Part(until_seen, seen[:count].astype(float))
-    dense_road, far = open_road(settings.readings_cones, DENSE_GAP), SensorSettings(range_max=DENSE_RANGE)
-    dense, readings = drive_log(dense_road, seed, sensor=far), []
-    for wanted in settings.readings:
-        log = thinned(dense, wanted, rng)
-        counts = np.array([len(cycle.labels) for cycle in log.cycles])
-        counts[: settings.warm_up] = -1
-        readings.append(Part(log, np.where(counts == wanted, float(wanted), np.nan), f"{wanted} readings: "))
-    closed, sensor = closed_road(settings.laps_cones), replace(LINE, range_max=DENSE_RANGE)
-    laps = drive_log(closed, seed, settings.laps)
-    ends = lap_times(laps)
-    lap = 1.0 + np.searchsorted(ends, [cycle.t for cycle in laps.cycles]).astype(float)
-    line = drive_log(closed, seed, 2, sensor=sensor, line=LineSettings(LINE_SPACING))
-    points = np.full(len(line.cycles), float(LINE_POINTS))
-    return {
-        CONES: Sweep([cones], np.exp(np.linspace(low, high, settings.bins + 1)), settings.fit_from),
-        READINGS: Sweep(readings, np.append(np.sort(settings.readings), np.inf)),
-        LAPS: Sweep([Part(laps, lap)], np.arange(1.0, len(ends) + 2.0), 2.0),
-        DENSE_LINE: Sweep([Part(line, points)], np.array([LINE_POINTS, np.inf])),
-    }
 
 
 def open_road(cones: int, gap: float) -> Track:
@@ -252,8 +191,7 @@ def open_road(cones: int, gap: float) -> Track:
 
     Its heading is `SWING * sin(2 pi s / WAVELENGTH)` at the length s along it; cones are `gap` (m) apart.
     """
-    length = SPARE * cones / 2 * gap
-    s = np.arange(0.0, length, STEP)
+    s = np.arange(0.0, SPARE * cones / 2 * gap, STEP)
     heading = SWING * np.sin(2 * np.pi * s / WAVELENGTH)
     middle = STEP * np.cumsum(np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
     return _with_rows(middle, gap, closed=False)
@@ -264,8 +202,7 @@ def closed_road(cones: int) -> Track:
     phi = np.linspace(0.0, 2 * np.pi, max(int(cones * GAP / STEP), 100))
     r = 1.0 + DENT * np.cos(DENTS * phi)
     unscaled = r[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
-    middle = unscaled * (cones / 2 * GAP / arc_lengths(unscaled)[-1])
-    return _with_rows(middle, GAP, closed=True)
+    return _with_rows(unscaled * (cones / 2 * GAP / arc_lengths(unscaled)[-1]), GAP, closed=True)
 
 
 def _with_rows(middle: Array, gap: float, closed: bool) -> Track:
@@ -273,7 +210,7 @@ def _with_rows(middle: Array, gap: float, closed: bool) -> Track:
     tangents = unit(np.gradient(middle, axis=0))
     rows = []
     for side in (0.5, -0.5):
-        row = middle + side * ROAD_WIDTH * left_normals(tangents)
+        row = middle + side * ROAD_WIDTH * left_of(tangents)
         s = arc_lengths(row)
         at = np.linspace(0.0, s[-1], max(round(s[-1] / gap), 2), endpoint=not closed)
         rows.append(along_polyline(at, s, row))
@@ -281,294 +218,204 @@ def _with_rows(middle: Array, gap: float, closed: bool) -> Track:
     return Track(rows[0], rows[1], np.zeros((0, 2)), closed, start, "road")
 
 
-def drive_log(track: Track, seed: int, laps: int = 1, **sensing: Any) -> Log:
-    """Simulate a drive along a road at full speed from the start on; `sensing` sets sensor and line."""
-    vehicle = VehicleSettings(speed_max=DRIVEN, speed_start=DRIVEN, acceleration_lateral=LATERAL)
-    return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, **sensing), seed)
+def sweep_drives(sweep: str, settings: ScalingSettings) -> list[tuple[Log, Array]]:
+    """Simulate the drives of a sweep: logs, and the abscissa (n,) of each cycle, NaN where it does not count.
+
+    A long road as its cones are seen, a short dense one with so many detections of each cycle, or a closed
+    one. Numbers of cones are the geometric means of intervals.
+    """
+
+    def drive(track: Track, laps: int = 1, **sensing: Any) -> Log:
+        vehicle = VehicleSettings(speed_max=DRIVEN, speed_start=DRIVEN, acceleration_lateral=LATERAL)
+        return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, **sensing), settings.seed)
+
+    if sweep == CONES:
+        log = drive(open_road(int(settings.cones_max), GAP))
+        seen = cones_seen(log)
+        edges = np.geomspace(settings.cones_min, settings.cones_max + 1.0, settings.bins + 1)
+        middles = np.concatenate([[np.nan], np.sqrt(edges[:-1] * edges[1:]), [np.nan]])
+        count = int(np.searchsorted(seen, settings.cones_max)) + 1
+        until_seen = replace(log, cycles=log.cycles[:count], truth=None)
+        return [(until_seen, middles[np.searchsorted(edges, seen[:count], side="right")])]
+    if sweep == READINGS:
+        road, rng = open_road(settings.readings_cones, DENSE_GAP), np.random.default_rng(settings.seed)
+        dense, drives = drive(road, sensor=SensorSettings(range_max=DENSE_RANGE)), list[tuple[Log, Array]]()
+        for wanted in settings.readings:
+            cycles = [seen.where(chosen(len(seen.labels), wanted, rng)) for seen in dense.cycles]
+            counts = np.array([len(seen.labels) for seen in cycles])
+            counted = (counts == wanted) & (np.arange(len(cycles)) >= settings.warm_up)
+            log = replace(dense, cycles=tuple(cycles), truth=None)
+            drives.append((log, np.where(counted, float(wanted), np.nan)))
+        return drives
+    closed = closed_road(settings.laps_cones)
+    if sweep == LAPS:
+        log = drive(closed, settings.laps)
+        lap = 1.0 + np.searchsorted(lap_times(log), [seen.t for seen in log.cycles])
+        return [(log, np.where(lap <= settings.laps, lap, np.nan))]
+    log = drive(closed, 2, sensor=replace(LINE, range_max=DENSE_RANGE), line=LineSettings(LINE_SPACING))
+    return [(log, np.full(len(log.cycles), float(LINE_POINTS)))]
 
 
 def cones_seen(log: Log) -> IntArray:
     """Return the number of true cones that had been detected by the end of each cycle (n,)."""
     assert log.truth is not None
     assert log.truth.associations is not None
-    ends = np.cumsum([len(cycle.labels) for cycle in log.cycles])
+    ends = np.cumsum([len(seen.labels) for seen in log.cycles])
     seen, first = np.unique(log.truth.associations, return_index=True)
     return np.searchsorted(np.sort(first[seen >= 0]), ends, side="left")
 
 
-def thinned(log: Log, count: int, rng: Generator) -> Log:
-    """Return the drive with `count` detections a cycle, chosen at random, or all where there are fewer."""
-    cycles = []
-    for cycle in log.cycles:
-        size = len(cycle.labels)
-        chosen = rng.choice(size, min(count, size), replace=False)
-        cycles.append(cycle.where(np.isin(np.arange(size), chosen)))
-    return replace(log, cycles=tuple(cycles), truth=None)
+def chosen(size: int, count: int, rng: np.random.Generator) -> BoolArray:
+    """Return which (size,) of some detections are kept: `count` at random, or all where there are fewer."""
+    return np.asarray(np.isin(np.arange(size), rng.choice(size, min(count, size), replace=False)))
 
 
-# --- updates of the sweeps -------------------------------------------------------------------------------
+def update_times(
+    drives: Sequence[tuple[Log, Array]], estimators: Sequence[str], mapper: MapperSettings, budget: float
+) -> pd.DataFrame:
+    """Return processor time (`seconds`) and map `size` of the updates of estimators, and their abscissa `at`.
 
-JUDGED: Final = 10  # number of updates whose mean is compared with the budget
-POINT: Final = ["sweep", "estimator", "at", "seconds", "cycles", "size"]  # columns of a point of a sweep
-SLOPE: Final = [*POINT[:2], "slope", "error", "points", "low", "high", "stopped"]  # and of its slope
-
-
-@dataclass(eq=False)
-class Lane:
-    """An estimator that is to map a log, and what was measured, until the log ended or it was stopped.
-
-    The update that closes a loop does not count: some solve their batch in it, others in another process.
+    On logs of one length all get each cycle in turn. The one that is first changes, so that none always
+    follows the same other. One whose last updates took over `budget` s on average stops, and the abscissa
+    that it had reached does not count. Nor do updates that close a loop: some solve their batch in it, others
+    in another process.
     """
-
-    estimator: str
-    part: Part
-    seconds: list[float] = field(default_factory=list)  # processor time of each update (s)
-    sizes: list[int] = field(default_factory=list)  # size of the map after each update
-    stopped: str = ""  # why it did not reach the log's end; empty where it did
-
-    def updates(self, settings: MapperSettings, budget: float) -> Iterator[None]:
-        """Do an update at each step, until the log ends or the lane is stopped."""
-        estimator, closed = make_online(self.estimator, settings, self.part.log), False
-        for odometry, detections in split_odometry(self.part.log):
-            try:
-                timed_wait(estimator)
-                estimate, _, seconds = timed_update(estimator, odometry, detections)
-            except Exception as error:  # the table reports any failure
-                self.stopped = " ".join(f"{type(error).__name__}: {error}".split())
-                return
-            self.seconds.append(seconds if estimate.closed == closed else np.nan)
-            closed = estimate.closed
-            self.sizes.append(sum(estimate.sizes))
-            if len(self.seconds) >= JUDGED and np.mean(self.seconds[-JUDGED:]) > budget:
-                self.stopped = f"over {budget:g} s an update"
-                return
-            yield
-
-
-def run_lanes(
-    lanes: Sequence[Lane],
-    settings: MapperSettings,
-    budget: float,
-    on_cycle: Callable[[], None] = lambda: None,
-) -> None:
-    """Give cycle k to every lane in turn; the lane that is first moves on by one with k.
-
-    So none always follows the same other. A lane stops if its last updates took over `budget` s on average.
-    """
-    runners = [lane.updates(settings, budget) for lane in lanes]
+    logs = [log for log, _ in drives]
+    running = {(k, name): make_online(name, mapper, log) for k, log in enumerate(logs) for name in estimators}
+    closed, last = dict.fromkeys(running, False), {key: deque[float]([], JUDGED) for key in running}
+    rows = list[tuple[str, float, float, int]]()
     with threadpool_limits(limits=1):
-        for number in range(max(len(lane.part.log.cycles) for lane in lanes)):
-            first = number % len(runners)
-            for runner in (*runners[first:], *runners[:first]):
-                next(runner, None)
-            on_cycle()
+        for number, cycles in enumerate(zip(*map(split_odometry, logs), strict=True)):
+            order = deque(running)
+            order.rotate(-number)
+            for key in order:
+                (k, name), estimator = key, running[key]
+                at = drives[k][1][number]
+                timed_wait(estimator)
+                estimate, _, seconds = timed_update(estimator, *cycles[k])
+                if estimate.closed == closed[key]:
+                    rows.append((name, at, seconds, sum(estimate.sizes)))
+                closed[key] = estimate.closed
+                last[key].append(seconds)
+                if len(last[key]) == JUDGED and np.mean(last[key]) > budget:
+                    del running[key]
+                    rows = [row for row in rows if row[:2] != (name, at)]
+    return pd.DataFrame(rows, columns=["estimator", "at", "seconds", "size"]).dropna()
 
 
-def binned(lane: Lane, edges: Array) -> pd.DataFrame:
-    """Return a point for each interval between two `edges` that holds cycles of a lane.
-
-    It has the means of `at`, of `seconds` of an update and of the map's `size`, and the number of `cycles`.
-    """
-    at = lane.part.at[: len(lane.seconds)]
-    frame = pd.DataFrame({"at": at, "seconds": lane.seconds, "size": lane.sizes})
-    bins = np.searchsorted(edges, frame["at"], side="right") - 1
-    inside = (bins >= 0) & (bins < len(edges) - 1)
-    points = frame[inside].groupby(bins[inside])
-    return points.mean().assign(cycles=points.size()).reset_index(drop=True)
-
-
-def fit_slope(points: pd.DataFrame, fit_from: float = 0.0) -> dict[str, float]:
-    """Return the power law `seconds ~ at^slope`, a line fitted to the logarithms from `fit_from` on.
-
-    `error` is the standard error of the exponent; both are NaN with too few `points`, from `low` to `high`.
-    """
-    kept = points[points["at"] >= fit_from].astype({"at": float, "seconds": float})
-    slope = error = float("nan")
-    if len(kept) > 2:  # two would leave nothing to estimate the error from
-        line = linregress(np.log(kept["at"]), np.log(kept["seconds"]))
-        slope, error = float(line.slope), float(line.stderr)
-    ends = {"low": float(kept["at"].min()), "high": float(kept["at"].max())}
-    return {"slope": slope, "error": error, "points": len(kept), **ends}
-
-
-def sweep_rows(
-    name: str,
-    estimators: Sequence[str],
-    settings: ScalingSettings,
-    mapper: MapperSettings,
-    sweep: Sweep,
-    on_cycle: Callable[[], None],
+def sweep_points(
+    sweep: str, estimators: Sequence[str], settings: ScalingSettings, mapper: MapperSettings
 ) -> list[dict[str, Any]]:
-    """Return the points of a sweep, each with its `cycles`, and the slope of each estimator."""
-    lanes = [Lane(estimator, part) for part in sweep.parts for estimator in estimators]
-    run_lanes(lanes, mapper, settings.budget, on_cycle)
-    rows: list[dict[str, Any]] = []
-    for estimator in estimators:
-        about = {"sweep": name, "estimator": estimator}
-        own = [lane for lane in lanes if lane.estimator == estimator]
-        found = [binned(lane, sweep.edges) for lane in own]
-        points = pd.concat([of for of in found if len(of)] or found[:1], ignore_index=True)
-        stopped = "; ".join(f"{lane.part.name}{lane.stopped}" for lane in own if lane.stopped)
-        rows += [about | point for point in points.to_dict("records")]
-        rows.append({**about, **fit_slope(points, sweep.fit_from), "stopped": stopped})
+    """Return the points of a sweep: mean `seconds` of an update and map `size` of the `cycles` at each."""
+    times = update_times(sweep_drives(sweep, settings), estimators, mapper, settings.budget)
+    rows = list[dict[str, Any]]()
+    for name in estimators:
+        updates = times[times["estimator"] == name].groupby("at")[["seconds", "size"]]
+        points = updates.mean().assign(cycles=updates.size()).reset_index()
+        rows += [{"sweep": sweep, "estimator": name, **point} for point in points.to_dict("records")]
     return rows
-
-
-# --- scaling ---------------------------------------------------------------------------------------------
-
-MARKER: Final = "scaling.json"  # file by which a folder of results is known
-COMPARED_AT: Final = 200.0  # number of cones at which estimators are compared, that of an ordinary track
-_HEIGHT: Final = 3.1  # height of a figure (in)
-
-
-@dataclass(frozen=True, eq=False)
-class Scaling:
-    """All results of the measurement."""
-
-    settings: ScalingSettings
-    mapper: dict[str, Any]
-    points: pd.DataFrame  # row for each mean of some updates, as `binned` returns them
-    slopes: pd.DataFrame  # row for each sweep and estimator, as `fit_slope` returns it
-
-    def of(self, sweep: str, estimator: str) -> pd.DataFrame:
-        return self.points[(self.points["sweep"] == sweep) & (self.points["estimator"] == estimator)]
-
-    def slope(self, sweep: str, estimator: str) -> pd.Series:
-        return self.slopes.set_index(["sweep", "estimator"]).loc[(sweep, estimator)]
-
-    @property
-    def estimators(self) -> tuple[str, ...]:
-        return tuple(self.slopes["estimator"].unique())
-
-    def seconds_at(self, cones: float, estimator: str) -> float:
-        """Return the mean update (s) at a number of cones, between the points; NaN beyond them."""
-        points = self.of(CONES, estimator)
-        if not len(points):
-            return float("nan")
-        at, seconds = np.log(points["at"]), np.log(points["seconds"])
-        return float(np.exp(np.interp(np.log(cones), at, seconds, left=np.nan, right=np.nan)))
 
 
 def measure_scaling(
     estimators: Sequence[str],
-    drives: dict[str, Sweep],
     settings: ScalingSettings,
     mapper: MapperSettings | None = None,
     folder: Path | None = None,
-    on_cycle: OnCell = lambda *_: None,
-) -> Scaling:
-    """Measure all sweeps, each kept in a folder at once, or read from there.
+    **how: Any,
+) -> pd.DataFrame:
+    """Return the points of all sweeps, which are kept in a folder; `how` is that of `rows_of`."""
+    same = {"estimators": tuple(estimators), "settings": settings, "mapper": mapper or MapperSettings()}
+    sweeps = [{"sweep": sweep, **same} for sweep in (CONES, READINGS, LAPS, DENSE_LINE)]
+    return rows_of(sweep_points, sweeps, folder, depends=[code_of(name) for name in estimators], **how)
 
-    `on_cycle` gets the numbers of cycles that are done, and of all that remained.
+
+# --- tables and files of the sweeps ----------------------------------------------------------------------
+
+MARKER: Final = "scaling.json"  # file by which a folder of results is known
+COMPARED_AT: Final = 200.0  # number of cones at which estimators are compared, that of an ordinary track
+
+
+def slopes_of(points: pd.DataFrame, settings: ScalingSettings) -> pd.DataFrame:
+    """Fit `seconds ~ at^slope` to the points of each sweep and estimator, on logarithms from some point on.
+
+    `error` is the standard error of the slope. With fewer than three points nothing estimates it.
     """
-    mapper, code = mapper or MapperSettings(), {name: code_of(name) for name in estimators}
-    shared = {"estimators": tuple(estimators), "settings": settings, "mapper": mapper}
-    done, total, found = 0, sum(sweep.cycles for sweep in drives.values()), []
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        on_cycle(done, total)
-
-    for name, sweep in drives.items():
-        before, others = done, {"sweep": sweep, "on_cycle": count}
-        found.append(rows_of(sweep_rows, [{"name": name, **shared}], folder, others=others, depends=code))
-        total -= sweep.cycles if done == before else 0  # it was kept
-    rows = pd.concat(found, ignore_index=True)
-    points, slopes = rows[rows["cycles"].notna()], rows[rows["cycles"].isna()]
-    return Scaling(settings, asdict(mapper), points[POINT].reset_index(drop=True), slopes[SLOPE])
+    begins, rows = {CONES: settings.fit_from, LAPS: 2.0}, []
+    for (sweep, name), every in points.groupby(["sweep", "estimator"], sort=False):
+        own = every[every["at"] >= begins.get(str(sweep), 0.0)]
+        row = {"sweep": sweep, "estimator": name, "slope": math.nan, "error": math.nan, "points": len(own)}
+        if len(own) > 2:
+            line = linregress(np.log(own["at"]), np.log(own["seconds"]))
+            row |= {"slope": line.slope, "error": line.stderr}
+        rows.append(row | {"low": own["at"].min(), "high": own["at"].max()})
+    return pd.DataFrame(rows)
 
 
-# --- table and files -------------------------------------------------------------------------------------
+def seconds_at(points: pd.DataFrame, cones: float) -> float:
+    """Return the mean update (s) at a number of cones, by the power law between points; NaN beyond them."""
+    if points.empty:
+        return math.nan
+    at, seconds = np.log(points["at"]), np.log(points["seconds"])
+    return float(np.exp(np.interp(np.log(cones), at, seconds, left=np.nan, right=np.nan)))
 
 
-def scaling_table(scaling: Scaling) -> Table:
+def scaling_table(points: pd.DataFrame, settings: ScalingSettings) -> Table:
     """Return a row for each estimator: slopes with standard errors, times, the ratio to the first."""
-    settings, first = scaling.settings, scaling.estimators[0]
-    shown = [*dict.fromkeys((2, settings.laps))]
+    names, laps = [*points["estimator"].unique()], [*dict.fromkeys((2, settings.laps))]
     header = (
         *("estimator", f"slope, cones ({settings.fit_from:g} to {settings.cones_max:g})", "slope, readings"),
-        *(f"ms at {COMPARED_AT:g} cones", f"{first} / this", "most cones"),
-        *(f"ms, lap {lap}" for lap in shown),
+        *(f"ms at {COMPARED_AT:g} cones", f"{names[0]} / this", "most cones"),
+        *(f"ms, lap {lap}" for lap in laps),
         f"ms, {LINE_POINTS} points of lines",
     )
-    rows = []
-    for name in scaling.estimators:
-        slopes = (scaling.slope(sweep, name) for sweep in (CONES, READINGS))
-        both = (figure(slope["slope"], slope["error"], 2) for slope in slopes)
-        at, laps = scaling.seconds_at(COMPARED_AT, name), scaling.of(LAPS, name).set_index("at")["seconds"]
-        alone = [1e3 * at, scaling.seconds_at(COMPARED_AT, first) / at, scaling.of(CONES, name)["at"].max()]
-        alone += [1e3 * laps.get(float(lap), math.nan) for lap in shown]
-        on_line = scaling.of(DENSE_LINE, name)["seconds"]
-        alone.append(math.nan if scaling.slope(DENSE_LINE, name)["stopped"] else 1e3 * on_line.iloc[0])
-        rows.append((name, *both, *figures(alone, 1, 2, 0, *[1] * len(shown), 1)))
+    fitted: Any = slopes_of(points, settings).itertuples()
+    slopes = {(of.sweep, of.estimator): figure(of.slope, of.error, 2) for of in fitted}
+    milliseconds = (1e3 * points.set_index(["sweep", "estimator", "at"])["seconds"]).to_dict()
+    cones = {name: points[(points["sweep"] == CONES) & (points["estimator"] == name)] for name in names}
+    first, rows = seconds_at(cones[names[0]], COMPARED_AT), []
+    for name in names:
+        at = seconds_at(cones[name], COMPARED_AT)
+        values = [1e3 * at, first / at, cones[name]["at"].max()]
+        places = [*((LAPS, name, float(lap)) for lap in laps), (DENSE_LINE, name, float(LINE_POINTS))]
+        values += [milliseconds.get(place, math.nan) for place in places]
+        both = (slopes.get((sweep, name), UNKNOWN) for sweep in (CONES, READINGS))
+        rows.append((name, *both, *figures(values, 1, 2, 0, *[1] * len(places))))
     return Table.of(header, rows, "Time per update: slopes of the logarithms, ± standard error")
 
 
-def stops(scaling: Scaling) -> list[str]:
-    """Return a line for each estimator and sweep that did not reach the end."""
-    lines = []
-    for row in scaling.slopes.to_dict("records"):
-        if row["stopped"]:
-            reached = f" (slope to {row['high']:.0f})" if row["points"] else ""
-            lines.append(f"{row['estimator']}, {row['sweep']}: stopped, {row['stopped']}{reached}")
-    return lines
-
-
-def write_scaling(out: Path, scaling: Scaling, *, force: bool = False) -> None:
+def write_scaling(
+    out: Path, points: pd.DataFrame, settings: ScalingSettings, mapper: MapperSettings, *, force: bool = False
+) -> None:
     """Write `points.csv`, `scaling.json` (with slopes and settings), `table.md` and the figure."""
-    at = {name: scaling.seconds_at(COMPARED_AT, name) for name in scaling.estimators}
     content = {
         "format": "pathspace-scaling/1",
-        "slopes": scaling.slopes.to_dict("records"),
-        "compared_at_cones": COMPARED_AT,
-        "seconds_compared": at,
-        "settings": asdict(scaling.settings),
-        "estimator_settings": scaling.mapper,
+        "slopes": slopes_of(points, settings).to_dict("records"),
+        "settings": asdict(settings),
+        "estimator_settings": asdict(mapper),
         "versions": versions(),
     }
     with atomic_folder(out, MARKER, force=force) as folder:
-        write_csv(folder / "points.csv", scaling.points)
-        scaling_table(scaling).write(folder, "table", "md")
+        write_csv(folder / "points.csv", points)
+        scaling_table(points, settings).write(folder, "table", "md")
         write_json(folder / MARKER, content)
-        style.save_figures(folder, {"scaling": plot_scaling(scaling)})
+        style.save_figures(folder, {"scaling": plot_scaling(points)})
 
 
-def plot_scaling(scaling: Scaling) -> Figure:
-    """Draw two sweeps on logarithmic axes, with fitted lines, and a cross where an estimator was stopped."""
+def plot_scaling(points: pd.DataFrame) -> Figure:
+    """Draw update times against map size and against detections, on logarithmic axes."""
     titles = {CONES: ("cones seen", "(a) map size"), READINGS: ("detections per update", "(b) detections")}
-    ticks = {
-        CONES: [n for n in (50, 100, 200, 500, 1000, 2000) if n <= scaling.settings.cones_max],
-        READINGS: scaling.settings.readings,
-    }
+    names, looks = points["estimator"].unique(), zip(cycle(style.PALETTE), cycle(style.MARKERS), strict=True)
+    look_of = dict(zip(names, looks, strict=False))
     with style.figure_context():
-        figure = Figure(figsize=(WIDTH, _HEIGHT), layout="constrained")
-        panels = figure.subplots(1, 2, sharey=True)
+        drawn = Figure(figsize=(style.WIDTH, 3.1), layout="constrained")
+        panels = drawn.subplots(1, 2, sharey=True)
         for axes, (sweep, (abscissa, title)) in zip(panels, titles.items(), strict=True):
-            for name, color, marker in zip(
-                scaling.estimators, cycled(PALETTE), cycled(MARKERS), strict=False
-            ):
-                points, slope = scaling.of(sweep, name), scaling.slope(sweep, name)
-                at, milliseconds = points["at"], 1e3 * points["seconds"]
-                if not len(points):
-                    continue
-                axes.plot(at, milliseconds, marker, color=color, label=name, markersize=3.6)
-                if np.isfinite(slope["slope"]):
-                    ends = slope[["low", "high"]].to_numpy(float)
-                    fitted = points[at.between(*ends)][["at", "seconds"]]
-                    middle, seconds = np.exp(np.log(fitted).mean())
-                    law = 1e3 * seconds * (ends / middle) ** slope["slope"]
-                    axes.plot(ends, law, color=color, linewidth=0.9, alpha=0.8)
-                if sweep == CONES and slope["stopped"]:
-                    axes.plot(at.iloc[-1], milliseconds.iloc[-1], "x", color=color, markersize=10.8)
-            axes.set(xscale="log", yscale="log", xlabel=abscissa, title=title)
-            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            axes.yaxis.set_minor_formatter(NullFormatter())
+            for name, (color, marker) in look_of.items():
+                own = points[(points["sweep"] == sweep) & (points["estimator"] == name)]
+                line: dict[str, Any] = {"marker": marker, "color": color, "markersize": 3.6, "linewidth": 0.9}
+                axes.loglog(own["at"], 1e3 * own["seconds"], label=name, **line)
+            axes.set(xlabel=abscissa, title=title)
             axes.grid(which="both")
-            axes.xaxis.set_major_locator(FixedLocator(ticks[sweep]))
-            axes.xaxis.set_major_formatter(ScalarFormatter())
-            axes.xaxis.set_minor_formatter(NullFormatter())
         panels[0].set_ylabel("mean update [ms]")
-        style.shared_legend(figure)
-    return figure
+        style.shared_legend(drawn)
+    return drawn

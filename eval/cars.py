@@ -1,62 +1,71 @@
-"""Simulated cars on generated tracks: where they are on a known map, and what several drives are worth."""
+"""Experiments of whole cars: on a known map, several drives of one track, and recordings of a real car.
+
+A real car has no truth. Its logs are mapped in three ways and compared with each other (docs/real.md).
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations, pairwise
+from math import inf
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
+from scipy.special import expit
 
+from pathspace_graph import estimators as registry
 from pathspace_graph.batch.joint import join
-from pathspace_graph.batch.known_map import map_of_cones
+from pathspace_graph.batch.known_map import KnownMap, map_of_cones
 from pathspace_graph.batch.mapper import BatchResult
+from pathspace_graph.batch.simplification import own_settings
+from pathspace_graph.batch.start import all_detections
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE, make_batch, make_online, settings_of
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import compose, inverse
+from pathspace_graph.factors.se2 import compose, inverse, path_lengths
+from pathspace_graph.factors.sensor import SENSOR
+from pathspace_graph.front_end.front_end import judge_log, seen_cycles
 from pathspace_graph.io.log import Log, Truth
-from pathspace_graph.io.map import Map
+from pathspace_graph.io.log_files import read_log
+from pathspace_graph.io.map import Map, read_map
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.places.find import SURE_ODDS, KnownRoad
+from pathspace_graph.places.passes import STRETCH, place_on, seen_in
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
-from .experiment.statistics import estimate
-from .experiment.tables import Table
+from .experiment.run import CELLS, run_study
+from .experiment.study import Study
+from .experiment.tables import Table, by_name, estimate, last_laps
 from .metrics.accuracy import lap_metrics, root_mean_square
-from .metrics.alignment import motion_onto, shape_rmse
+from .metrics.alignment import aligned_distance, end_by_registration, maps_apart, motion_onto, shape_rmse
 from .metrics.consistency import consistency_at_cones, map_nees
+from .metrics.measures import METRICS, UNKNOWN, Metric, figure, figures
 from .metrics.reference import truth_of
 from .metrics.trajectory import interpolate_poses, position_rms, trajectory_errors
-
-Columns = Mapping[str, tuple[str, int, float]]  # of a table, by their key: heading, digits, factor
 
 CARS: Final[Mapping[str, SimulationSettings]] = {
     "plain": SimulationSettings(laps=2),
     "drawn": SimulationSettings(laps=2, draw=True),
+    "lines": replace(preset({"sensor": "line"}), laps=2),
 }
-"""Cars with white noise, and others, each drawn with errors of its own."""
+"""Cars with white noise, others, each drawn with errors of its own, and cars that see points of lines."""
 
 
-def on_tracks(tracks: Sequence[int], **same: Any) -> list[dict[str, Any]]:
+def on_tracks(
+    tracks: Sequence[int], cars: Sequence[str] = ("plain", "drawn"), **same: Any
+) -> list[dict[str, Any]]:
     """Return the arguments of a function of each car on each track, with the same others."""
-    return [{"car": car, "track": track, **same} for track in tracks for car in CARS]
+    return [{"car": car, "track": track, **same} for track in tracks for car in cars]
 
 
 def drive(car: str, track: int, seed: int) -> Log:
     """Return a drive of a car on the generated track of a number."""
     return simulate(generate_track(np.random.default_rng(track)), CARS[car], seed)
-
-
-def over_tracks(title: str, parts: Mapping[str, pd.DataFrame], columns: Columns) -> Table:
-    """Return a row for each part, over tracks: the drives of one are no sample."""
-    rows = []
-    for label, part in parts.items():
-        means = part.groupby("track")[[*columns]].mean()
-        texts = (estimate(means[key]).text(digits, factor) for key, (_, digits, factor) in columns.items())
-        rows.append((label, *texts))
-    return Table.of((title, *(heading for heading, _, _ in columns.values())), rows)
 
 
 # --- known maps --------------------------------------------------------------------------------------------
@@ -67,13 +76,13 @@ MOVED_CONES, MOVED_BY = 7, 2.5  # number of neighbours on the left that were mov
 SOON: Final = 8.0  # time after which the vehicle should be found (s)
 DRIVEN: Final = 40.0  # time that is driven on a known map (s)
 WRONG: Final = 2.0  # distance (m) from the true pose at which the place where it was found is a wrong one
-KNOWN: Final[Columns] = {
-    "found": ("found [%]", 0, 100.0),
-    "soon": (f"within {SOON:.0f} s [%]", 0, 100.0),
-    "wrong": ("at a wrong place [%]", 0, 100.0),
-    "error": ("pose error [m]", 2, 1.0),
-    "map": ("rmse of the map [m]", 2, 1.0),
-}
+KNOWN: Final = (
+    Metric("found", "found", "%", 0),
+    Metric("soon", f"within {SOON:.0f} s", "%", 0),
+    Metric("wrong", "at a wrong place", "%", 0),
+    Metric("error", "pose error", "m", 2),
+    Metric("map", "rmse of the map", "m", 2),
+)
 
 
 def known_of_track(car: str, track: int, begins: Sequence[float]) -> list[dict[str, Any]]:
@@ -142,20 +151,66 @@ def drive_on(known: Map, log: Log, share: float, motion: Array) -> dict[str, Any
 
 def known_table(frame: pd.DataFrame) -> Table:
     """Return a row for each car and kind of map."""
-    groups = frame.groupby(["car", "kind"], sort=False)
-    parts = {f"{car}, {kind} ({len(part)} drives)": part for (car, kind), part in groups}
-    return over_tracks("cars, known map", parts, KNOWN)
+    count = frame.groupby(["car", "kind"])["track"].transform("size").astype(str)
+    named = {"cars": frame["car"], "known map": frame["kind"] + " (" + count + " drives)"}
+    return by_name(frame.assign(**named), [*named], KNOWN)
+
+
+SEARCH_INTERVAL: Final = 10.0  # distance from one search to the next (m)
+FIRST_SEARCH: Final = 20.0  # path before the first one (m)
+ODDS: Final = (-100.0, 0.0, 2.0, 4.0, SURE_ODDS, 10.0, 15.0, 100.0)  # edges of the rows of claimed log odds
+
+
+def odds_of_track(car: str, track: int) -> list[dict[str, Any]]:
+    """Return a row for each search of the second drive of a track, on its own map and on another track's.
+
+    Each knows only the path and the detections of the last metres.
+    """
+    first, log = (drive(car, track, seed) for seed in (0, 1))
+    settings = settings_of(MapperSettings(), log)
+    judged = judge_log(log, known_noise(log.noise), own_settings(settings))
+    poses, truth = judged.chain.dead_reckoned(judged.chain.calibration_mean), truth_of(log)
+    motion = motion_onto(truth.cones, truth_of(first).cones)
+    true = compose(motion, interpolate_poses(truth.pose_t, truth.poses, judged.chain.stamps))
+    table, driven, rows = all_detections(judged), path_lengths(poses), list[dict[str, Any]]()
+    due = np.arange(FIRST_SEARCH, driven[-1], SEARCH_INTERVAL)
+    for kind, other in ((OWN, first), (OTHER, drive(car, track + 1000, 0))):
+        known = KnownMap.of(mapped(other), False, settings.of_lines)
+        road = KnownRoad.of(known.splines, known.cones)
+        for newest in np.unique(driven.searchsorted(due)).tolist():
+            lately = np.flatnonzero(driven[: newest + 1] > driven[newest] - STRETCH)
+            recent = seen_in(replace(table, cycle=table.cycle - lately[0]))
+            place = place_on(road, recent, poses[lately], settings)
+            odds = np.nan if place is None or place.odds == -inf else place.odds  # JSON has no infinity
+            right = place is not None and np.hypot(*(place.pose - true[newest])[:2]) < WRONG
+            rows.append(
+                {"car": car, "track": track, "kind": kind, "odds": odds, "wrong": not right or kind == OTHER}
+            )
+    return rows
+
+
+def odds_table(frame: pd.DataFrame) -> Table:
+    """Return how many places are wrong, and how many their odds expect, by the log odds that they claim."""
+    rows, expected = list[Sequence[str]](), expit(-frame["odds"])
+    for name, chosen in {
+        "no place": frame["odds"].isna(),
+        **{f"{low:g} to {high:g}": frame["odds"].between(low, high) for low, high in pairwise(ODDS)},
+    }.items():
+        counts = frame["kind"][chosen].value_counts().reindex([OWN, OTHER], fill_value=0)
+        wrong = figures([frame["wrong"][chosen].sum(), expected[chosen].sum()], 0, 1)
+        rows.append((name, *map(str, counts), *(wrong if rows else [UNKNOWN, UNKNOWN])))
+    return Table.of(("log odds", f"on {OWN}", f"on {OTHER}", "wrong", "wrong by the odds"), rows)
 
 
 # --- several drives as one batch ---------------------------------------------------------------------------
 
-JOINT: Final[Columns] = {
-    "shape": ("rmse of the shape [m]", 3, 1.0),
-    "ratio": ("by half as many", 2, 1.0),
-    "nees": ("NEES", 2, 1.0),
-    "inside": ("within 2σ [%]", 1, 100.0),
-    "ate": ("trajectory error [m]", 3, 1.0),
-}
+JOINT: Final = (
+    Metric("shape", "rmse of the shape", "m"),
+    Metric("ratio", "by half as many", digits=2),
+    Metric("nees", "NEES", digits=2),
+    Metric("inside", "within 2σ", "%", 1),
+    Metric("ate", "trajectory error", "m"),
+)
 
 
 def joint_of_track(car: str, track: int, drives: int) -> list[dict[str, Any]]:
@@ -190,7 +245,7 @@ def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) 
     errors = [trajectory_errors(own[name].trajectory_t, own[name].trajectory, truths[name]) for name in own]
     return {
         "shape": shape_rmse(track, truths[first]),
-        "nees": map_nees(track, truths[first]).ratio,
+        "nees": map_nees(track, truths[first]),
         "inside": consistency_at_cones(track, truths[first])["inside"],
         "ate": float(np.mean([position_rms(one) for one in errors])),
         "mapped": len(own),
@@ -200,8 +255,93 @@ def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) 
 def joint_table(frame: pd.DataFrame) -> Table:
     """Return a row for each kind of car and number of drives, with the shape by that of half as many."""
     shape = frame.groupby(["car", "track", "drives"])["shape"].mean()
-    parts = {}
-    for (car, count), part in frame.groupby(["car", "drives"], sort=False):
-        half = [shape.get((car, track, count // 2), np.nan) for track in part["track"]]
-        parts[f"{car}, {count} drive{'s' if count > 1 else ''}"] = part.assign(ratio=part["shape"] / half)
-    return over_tracks("cars, drives of a track", parts, JOINT)
+    half = shape.reindex(pd.MultiIndex.from_arrays([frame["car"], frame["track"], frame["drives"] // 2]))
+    count = frame["drives"].astype(str) + np.where(frame["drives"] > 1, " drives", " drive")
+    named = {"cars": frame["car"], "drives of a track": count}
+    return by_name(frame.assign(ratio=frame["shape"] / half.to_numpy(), **named), [*named], JOINT)
+
+
+# --- logs of a real car ----------------------------------------------------------------------------------
+
+RUNS: Final = (registry.DEFAULT_ONLINE, registry.DEFAULT_BATCH, "landmark-fixed-lag")
+SHOWN: Final = {  # metrics of each run, with short titles
+    "closed_at_end": "closed",
+    "end_off": "end off by",
+    "end_turn": "turned by",
+    "reckoned_off": "dead reckoning off by",
+    "reckoned_turn": "dead reckoning turned by",
+    "crossings": "crossings",
+    "crossings_own": "own crossings",
+    "reported_degraded": "degraded",
+    "reported_lost": "lost",
+    "ms_processor": "update",
+}
+ERRORS: Final = {  # errors of the sensor in the table, with titles and units
+    "latency": ("latency [ms]", 1e3),
+    "yaw": ("yaw [°]", 180.0 / np.pi),
+    "range_scale": ("scale [%]", 100.0),
+}
+
+
+def real_tables(folders: Sequence[Path], out: Path, **how: Any) -> dict[str, Table]:
+    """Map logs that `convert` has written by all estimators of `RUNS`; `how` is that of `run_records`."""
+    logs = {folder.name: read_log(folder) for folder in folders}
+    study = Study(name="real", logs={folder.name: (folder,) for folder in folders}, estimators=RUNS)
+    runs = last_laps(run_study(study, out, keep=True, **how))
+    shown = [replace(METRICS[key], title=title) for key, title in SHOWN.items()]
+    return {
+        "runs": by_name(runs, ("track", "estimator"), shown),
+        "maps": maps_table(runs, out / CELLS),
+        "joint": real_joint_table(logs),
+        "measured": measured_table(logs),
+    }
+
+
+def maps_table(runs: pd.DataFrame, cells: Path) -> Table:
+    """Return the distance between the maps of each two drives around the same cones: under a metre."""
+    maps = {(run.track, run.estimator): read_map(cells / run.cell) for run in runs.itertuples()}
+    rows = []
+    for pair in combinations(runs["track"].unique(), 2):
+        apart = [aligned_distance(*(maps[track, name] for track in pair)) for name in RUNS]
+        if min(apart) < 1.0:
+            rows.append((", ".join(pair), *figures(apart, 2)))
+    return Table.of(("maps", *(f"{name} [m]" for name in RUNS)), rows)
+
+
+def real_joint_table(logs: Mapping[str, Log]) -> Table:
+    """Return how far each drive's own batch is from that of all drives, and both from the last pose."""
+    alone = {name: solve_alone(log) for name, log in logs.items()}
+    joint, rows = join(alone), []
+    for name, together in joint.drives.items():
+        apart = maps_apart(alone[name].map, together.map).statistics()["both"]
+        pose = compose(inverse(joint.frames[name]), together.trajectory[-1])
+        end = end_by_registration(seen_cycles(logs[name])[0], logs[name].measured)
+        ends = [
+            np.nan if end is None else np.hypot(*(of - end)[:2]) for of in (alone[name].trajectory[-1], pose)
+        ]
+        rows.append((name, *figures([*apart.values(), *ends], 2)))
+    apart_by = ("map apart, mean [m]", "rms [m]", "p95 [m]", "largest [m]")
+    return Table.of(("drive", *apart_by, "end off by, alone [m]", "together [m]"), rows)
+
+
+def measured_table(logs: Mapping[str, Log]) -> Table:
+    """Return what was measured on each drive, and over all of them the mean with its interval."""
+    header = (
+        *("log", "vx [m/s]", "vy [m/s]", "wz [rad/s]", "along at 10 m [m]", "across at 10 m [m]"),
+        *("stays along [%]", "stays across [%]", *(title for title, _ in ERRORS.values())),
+    )
+    units, places = [unit for _, unit in ERRORS.values()], [SENSOR.index(name) for name in ERRORS]
+    rows, errors, at = [], [], np.array([10.0])
+    for name, found in ((name, log.measured) for name, log in logs.items()):
+        if found is None or found.along is None or found.across is None:
+            continue
+        rays = (found.along, found.across)
+        values = [*found.odometry, *(ray.sigmas(at)[0] for ray in rays), *(100.0 * ray.share for ray in rays)]
+        errors.append(found.sensor[places] * units)
+        halves = 1.96 * found.sensor_sigma[places] * units
+        texts = (figure(*pair, 1) for pair in zip(errors[-1].tolist(), halves.tolist(), strict=True))
+        rows.append((name, *figures(values, 4, 4, 4, 2, 2, 0, 0), *texts))
+    if len(errors) > 1:
+        means = (figure(*estimate(column), 1) for column in np.transpose(errors))
+        rows.append(("all drives", *[UNKNOWN] * 7, *means))
+    return Table.of(header, rows)

@@ -11,21 +11,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pandas as pd
 
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.io.parsing import parse_toml, read_text
 from pathspace_graph.settings.evaluation import ScalingSettings
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
 
-from . import cars, real
-from .benchmark import QUICK, SPEED, make_drives, measure_scaling, scaling_table, speed_of_drive
+from . import cars
+from .benchmark import QUICK, SPEED, measure_scaling, scaling_table, speed_on
 from .experiment.faults import at_strength, fault_table, kinds, only, outcomes
 from .experiment.provenance import made
-from .experiment.run import RowsOf, make_plan, rows_of, run_study
-from .experiment.statistics import RUN_OF, estimate, last_laps
+from .experiment.run import make_plan, rows_of, run_study
 from .experiment.study import Drive, Study, find_study, read_study_file
-from .experiment.tables import Table, by_metric, by_name, contrast_table, mean, write_csv
-from .metrics.measures import METRICS, UNKNOWN
+from .experiment.tables import RUN_OF, Table, by_metric, by_name, contrast_table, last_laps, mean, write_csv
+from .metrics.measures import METRICS, UNKNOWN, Metric
 from .metrics.reference import landmark_rmse, solve_oracle_landmarks, truth_of
 
 ONLINE, BATCH, LANDMARKS = "fixed-lag", "spline", "landmark-fixed-lag"
@@ -49,6 +52,7 @@ class ReportPlan:
 
     @property
     def how(self) -> dict[str, Any]:
+        """Return how studies run."""
         return {"jobs": self.jobs, "on_cell": self.on_cell}
 
     def study(self, folder: Path) -> Tables:
@@ -70,12 +74,14 @@ class ReportPlan:
             frame = pd.concat([frame, other], ignore_index=True)
         found = dict[str, Table]()
         for part, wanted in about["tables"].items():
-            options = {key: value for key, value in wanted.items() if key != "kind"}
+            options = {key: value for key, value in wanted.items() if key not in {"kind", "metrics"}}
+            if "metrics" in wanted:
+                options["metrics"] = [METRICS[key] for key in wanted["metrics"]]
             found[part] = KINDS[wanted["kind"]](study, frame, **options)
         if folder.name == "camera":
             drives = dict.fromkeys(cell.drive for cell in make_plan(study).cells)
-            limits = self.rows(landmark_limit, [{"drive": drive} for drive in drives], folder / "landmarks")
-            limit = mean("rmse", limits)
+            parts = [{"drive": drive} for drive in drives]
+            limit = mean(METRICS["rmse"], rows_of(landmark_limit, parts, folder / "landmarks", **self.how))
             frame = found[""].frame
             frame.loc[len(frame)] = ["landmarks, given all", limit, *[UNKNOWN] * (frame.shape[1] - 2)]
         return found
@@ -83,38 +89,36 @@ class ReportPlan:
     def joint(self, folder: Path) -> Tables:
         tracks, drives = ((50,), 2) if self.quick else ((50, 51, 52), 8)
         parts = cars.on_tracks(tracks, drives=drives)
-        return {"": cars.joint_table(self.rows(cars.joint_of_track, parts, folder))}
+        return {"": cars.joint_table(rows_of(cars.joint_of_track, parts, folder, **self.how))}
 
     def known(self, folder: Path) -> Tables:
         tracks, begins = ((60,), (0.3,)) if self.quick else (range(60, 68), (0.0, 0.3, 0.6))
         parts = cars.on_tracks(tracks, begins=begins)
-        return {"": cars.known_table(self.rows(cars.known_of_track, parts, folder))}
+        drives = rows_of(cars.known_of_track, parts, folder, **self.how)
+        searches = rows_of(
+            cars.odds_of_track, cars.on_tracks(tracks, [*cars.CARS]), folder / "odds", **self.how
+        )
+        return {"": cars.known_table(drives), "odds": cars.odds_table(searches)}
 
     def speed(self, _: Path) -> Tables:
         """Time every estimator in turn on the same cycles."""
         seeds, laps = (GENERATED[:1], 1) if self.quick else (GENERATED, 5)
-        runs = pd.DataFrame([speed_of_drive(seed, laps) for seed in seeds]).reindex(columns=[*SPEED])
-        rows = ((label, estimate(runs[key]).text(digits)) for key, (label, digits) in SPEED.items())
-        return {"": Table.of(("figure", "measured"), rows)}
+        rows = []
+        for seed in seeds:
+            track = generate_track(np.random.default_rng(seed))
+            log = simulate(track, SimulationSettings(laps=laps), seed)
+            rows.append({"track": seed, **speed_on(log, MapperSettings())})
+        return {"": by_metric({"measured": pd.DataFrame(rows)}, SPEED)}
 
     def real_logs(self, folder: Path) -> Tables:
         if not self.real:
             raise SettingsError("--only real: expected logs in --real, found none")
-        drives = real.map_real_logs(self.real, folder, **self.how)
-        return {
-            "runs": real.runs_table(drives),
-            "maps": real.maps_table(drives),
-            "joint": real.joint_table(drives),
-            "measured": real.measured_table(drives),
-        }
+        return cars.real_tables(self.real, folder, **self.how)
 
     def scale(self, folder: Path) -> Tables:
         settings = QUICK if self.quick else ScalingSettings(cones_max=800.0, laps=10)
-        scaling = measure_scaling((ONLINE, LANDMARKS), make_drives(settings), settings, folder=folder)
-        return {"": scaling_table(scaling)}
-
-    def rows(self, function: RowsOf, parts: list[dict[str, Any]], folder: Path) -> pd.DataFrame:
-        return rows_of(function, parts, folder, **self.how)
+        points = measure_scaling((ONLINE, LANDMARKS), settings, folder=folder, on_cell=self.on_cell)
+        return {"": scaling_table(points, settings)}
 
 
 EXPERIMENTS: Final[Mapping[str, Callable[[ReportPlan, Path], Tables]]] = {
@@ -163,7 +167,7 @@ def write_report(plan: ReportPlan, folder: Path, names: Sequence[str] = ()) -> I
 # --- kinds of tables -------------------------------------------------------------------------------------
 
 
-def laps_table(study: Study, frame: pd.DataFrame, laps: Sequence[int], metrics: Sequence[str]) -> Table:
+def laps_table(study: Study, frame: pd.DataFrame, laps: Sequence[int], metrics: Sequence[Metric]) -> Table:
     """Return metrics of the online map after some laps, and of the batch where it ran."""
     online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
     shown = [lap for lap in laps if lap <= study.laps] or [study.laps]
@@ -174,7 +178,7 @@ def laps_table(study: Study, frame: pd.DataFrame, laps: Sequence[int], metrics: 
 def estimators_table(
     study: Study,
     frame: pd.DataFrame,
-    metrics: Sequence[str],
+    metrics: Sequence[Metric],
     estimators: Sequence[str] = (),
     lap: int | None = None,
 ) -> Table:
@@ -210,17 +214,16 @@ def rmse_table(_: Study, frame: pd.DataFrame) -> Table:
     laps = frame[frame["lap"] > 0]
     several = laps.groupby("estimator", sort=False)["lap"].transform("nunique") > 1
     names = {name: runs.groupby("lap") for name, runs in laps[several].groupby("estimator", sort=False)}
-    rows = [
-        (str(lap), *(mean("rmse", of.get_group(lap)) for of in names.values()))
-        for lap in sorted(laps["lap"].unique())
-    ]
+    rmse, rows = METRICS["rmse"], []
+    for lap in sorted(laps["lap"].unique()):
+        rows.append((str(lap), *(mean(rmse, of.get_group(lap)) for of in names.values())))
     return Table.of(("rmse after lap [m]", *names), rows)
 
 
-def skidpad_table(_: Study, frame: pd.DataFrame, metrics: Sequence[str]) -> Table:
+def skidpad_table(_: Study, frame: pd.DataFrame, metrics: Sequence[Metric]) -> Table:
     """Return every estimator: its trajectory error over the whole drive, and its map at the end."""
     square = (frame["ate"] ** 2).groupby([frame[name] for name in RUN_OF]).transform("mean")
-    return by_name(frame.assign(ate=square**0.5), ("estimator",), metrics)
+    return by_name(last_laps(frame.assign(ate=square**0.5)), ("estimator",), metrics)
 
 
 KINDS: Final[Mapping[str, Callable[..., Table]]] = {
@@ -230,7 +233,7 @@ KINDS: Final[Mapping[str, Callable[..., Table]]] = {
     "rmse": rmse_table,
     "skidpad": skidpad_table,
     "differences": contrast_table,
-    "runs": lambda _, frame, names, metrics: by_name(frame, names, metrics),
+    "runs": lambda _, frame, names, metrics: by_name(last_laps(frame), names, metrics),
     "faults": lambda study, frame: fault_table(study, outcomes(study, frame)),
 }
 """Tables of a study and its results, with options."""

@@ -60,10 +60,8 @@ _Parts = tuple[IntArray, Array, Array, IntArray]
 """The fields of `graph.rows:Rows`."""
 _FootPoints = tuple[Array, Array, Array, Array, Array, BoolArray, Array, IntArray, IntArray]
 """The fields of `factors.footpoint:FootPoints`."""
-_Followed = tuple[Array, IntArray, Array, Array, IntArray]
-"""Place (k, 2) of each cone that is followed, its label (k,), least range, latest stamp and number."""
-_Tracks = tuple[Array, Array, IntArray, Array]
-"""Points (n, 2), information (n, 2, 2), counts of detections (n,) and latest stamps (n,) of tracks."""
+_Tracks = tuple[Array, Array, IntArray, Array, IntArray]
+"""Points (n, 2), information (n, 2, 2), detections by label (n, 5), newest stamps (n,) and numbers (n,)."""
 _Cones = tuple[Array, Array, IntArray]
 """Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
 
@@ -115,7 +113,10 @@ def to_map(points_vehicle: Array, poses: Array) -> Array:
     """Return `p = R z + t` (m, 2), map frame: points z (m, 2) in the vehicle frames of poses (m, 3)."""
 
 def shifted(measured: Array, twists: Array, sensor: Array) -> Array:
-    """Return `z + C b` (m, 2) of detections z (m, 2): C of `sensor:by_sensor` and a calibration b (5,)."""
+    """Return `z + C b` (m, 2) of detections z (m, 2): C of `sensor:by_sensor` and a calibration b (5,).
+
+    Twists are (m, 3), or (3,) for all.
+    """
 
 def detection_rows(
     points_map: Array,
@@ -165,6 +166,23 @@ def station_rows(
         dr/dp = t,   dr/dc_j = -beta_j(u) t + n . (p - S) beta'_j(u) / |S'| n
 
     The rest is as in `detection_rows`.
+    """
+
+def held_twists(
+    stamps: Array,
+    twists: Array,
+    until: float,
+    first: float,
+    interval: float,
+    hold: tuple[float, float],
+    accelerations: tuple[float, float, float],
+) -> tuple[Array, Array, float, bool, int]:
+    """Return the durations (k,) of twists (k, 3), held until the next one or `until` (s), and their excess.
+
+    The excess, (k, 3) or (3,) if it is zero, grows by `accelerations` while a twist is held for longer than
+    `hold[0]` s and `hold[1]` shortest intervals; the first twist was measured at `first` (s). The other
+    results are the shortest `interval` so far, whether the last twist is held for longer, and the number of
+    twists that equal the one before.
     """
 
 def integrated(durations: Array, twists: Array, sigmas: Array) -> tuple[Array, Array, Array]:
@@ -299,25 +317,6 @@ def usable(points: Array, covariances: Array, limits: tuple[float, ...]) -> tupl
     The limits are those of the range, MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA and MAX_SIGMA.
     """
 
-def followed(
-    begins: IntArray,
-    stamps: Array,
-    places: Array,
-    points: Array,
-    labels: IntArray,
-    ranges: Array,
-    along: Array,
-    across: Array,
-    cones: _Followed,
-    count: int,
-    limits: tuple[float, float, float],
-) -> tuple[IntArray, _Followed, int]:
-    """Return the number (m,) of the cone of each detection, or -1, the cones then, and their count so far.
-
-    Detections at points (m, 2) have gates along and across their rays (m,), and begin at `begins` (c + 1,) in
-    cycles at times (c,) and places (c, 2). The limits are `MAX_AGE` and `FOLLOWING`.
-    """
-
 def matched(
     recent: Array,
     points_vehicle: Array,
@@ -325,19 +324,63 @@ def matched(
     start: Array,
     reaches: Sequence[float],
     limits: tuple[float, ...],
+    line: tuple[float, ...],
+    held: Array,
 ) -> tuple[Array, Array, BoolArray, float]:
-    """Return the pose (3,) of `match`, and information (3, 3), matches (m,) and cost of its last step."""
+    """Return the pose (3,) of `ScanMatcher.match`; of its last step information, matches (m,) and cost.
+
+    The limits are `FARTHEST`, `MIN_WEIGHT`, `SCAN_HUBER`, `SIGMA_CONE`, `MIN_MATCHED` and `LEAST_SHARE`. For
+    points of lines, `line` has the limits from `LINE_REACH` on, `held` (3, 3) is information about the start,
+    and all results are those at the pose.
+    """
+
+def misfit(
+    recent: Array,
+    points_vehicle: Array,
+    variances: Array,
+    pose: Array,
+    reach: float,
+    limits: tuple[float, ...],
+    line: tuple[float, ...],
+    most: float,
+) -> float:
+    """Return the mean square, each at most `most`, of the whitened distances of `matched` at a pose (3,)."""
 
 def weighted_means(points: Array, recent: Array, reach: float, farthest: float) -> tuple[Array, Array]:
     """Return means (m, 2) of recent points by `exp(-d^2 / 2 reach^2)`, and the sums of weights."""
 
-def off_prediction(
-    pose: Array, information: Array, excess: float, predicted: Array, covariance: Array
-) -> tuple[Array, Array]:
-    """Return how far a match, of variance times `excess`, is off a prediction, and its covariance."""
+def standstill_gains(
+    points: Array,
+    covariances: Array,
+    pose: Array,
+    cycles: Sequence[tuple[Array, Array]],
+    shares: Sequence[float],
+    sigma: float,
+    most: float,
+) -> Array:
+    """Return the gains (h + 1, k) of a cycle with k others, a row for each hypothesis.
 
-def squared(off: Array, covariance: Array, shifts: Array, errors: Array) -> float:
-    """Return `d' (K + S P S')^-1 d` of an offset d (3,) with K (3, 3), S (3, 2) and P (2, 2)."""
+    A hypothesis is a share of the motion by odometry. The gain of a detection (m, 2), with covariance (m, 2,
+    2), is `max(0, most - d^2)` with its distance d from the nearest one of the other cycle, whitened by twice
+    the covariance plus `sigma^2`. Cycles have points (n, 2), vehicle frame, and a pose (3,) by odometry.
+    Detections outside the other cycle's view, by odometry, have no gain: the view moves with the vehicle, and
+    its border matches only at standstill. The last row sums (first - last hypothesis)^2 over detections.
+    """
+
+def off_prediction(
+    pose: Array,
+    information: Array,
+    excess: float,
+    predicted: Array,
+    covariance: Array,
+    shifts: Array,
+    errors: Array,
+) -> tuple[Array, Array, Array, float]:
+    """Return how far a match, of variance times `excess`, is off a prediction.
+
+    The offset d (3,) has the covariance K (3, 3) without errors of the sensor, and `K + S P S'` with them, by
+    its derivatives S (3, 2) and their covariance P (2, 2). The last result is `d' (K + S P S')^-1 d`.
+    """
 
 def learned(
     mean: Array, errors: Array, drift: Array, off: Array, covariance: Array, shifts: Array, share: float
@@ -451,20 +494,25 @@ def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array
 
 # --- cones -----------------------------------------------------------------------------------------------
 def merged(
-    known: _Tracks, points: Array, covariances: Array, t: float, gate: tuple[float, float, float]
-) -> _Tracks:
-    """Return the columns of tracks with detections added as `TentativeTracks.add` does.
+    known: _Tracks,
+    points: Array,
+    covariances: Array,
+    labels: IntArray,
+    stamps: Array,
+    following: int,
+    gate: tuple[float, float, float, float, bool],
+) -> tuple[_Tracks, IntArray]:
+    """Return the columns of tracks with detections added as `Tracks.add` does, and the number (m,) of each.
 
-    The gate is a radius (m), its multiple within which smeared detections are tested, and their sigmas.
+    New tracks are numbered from `following` on. The gate is a radius (m), its multiple within which smeared
+    detections are tested, their sigmas, the memory (s), and whether labels must be equal.
     """
-
-def merged_in_turn(points: Array, covariances: Array, gate: tuple[float, float, float]) -> _Tracks:
-    """Return the columns of tracks to which detections (m, 2) are added one after another."""
 
 def laid(
     seen: _Cones,
     known: _Cones,
     views: Array,
+    centres: Array,
     means: Array,
     prior: Array,
     reach: tuple[float, float],
@@ -472,7 +520,7 @@ def laid(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the places where seen cones may lie, as `places.find:find` compares them.
 
-    They are poses (m, 3) about the means (k, 3), the information (m, 3, 3) about each from the cones that lie
+    They are poses (m, 3) about centres (k, 3), the information (m, 3, 3) about each from the cones that lie
     on others, the sum (m,) of the capped squares of the cones in view, their number (m,), and the square (m,)
-    of the way from the mean.
+    of the way from its mean (k, 3).
     """

@@ -1,4 +1,4 @@
-"""GTSAM factors for any nonlinear graph: projection, stations, spacing, smoothness and odometry.
+"""GTSAM factors for any nonlinear graph: projection, stations, smoothness and odometry.
 
 A factor has its measurement and its keys, but no state: its error is a pure function of the values.
 """
@@ -170,7 +170,7 @@ def _detection_factor(
 
 
 def boundary_point_factor(
-    control_keys: Sequence[int],
+    control_keys: Sequence[int] | IntArray,
     tables: SpanPolynomials,
     *,
     points_map: Array,
@@ -210,7 +210,7 @@ class Curve:
     high: Array  # limits (m,) of the stretch in which each foot point is searched
 
     @staticmethod
-    def of(control_keys: Sequence[int], tables: SpanPolynomials, low: Array, high: Array) -> Curve:
+    def of(control_keys: Sequence[int] | IntArray, tables: SpanPolynomials, low: Array, high: Array) -> Curve:
         """Select, from the keys of all distinct control points, those that matter in the stretches (m,)."""
         if len(control_keys) != tables.size:
             raise ValueError(
@@ -280,23 +280,6 @@ def fill(H: JacobianList, blocks: Sequence[Array]) -> None:
         if block.ndim != 2 or len(block) != len(blocks[0]):
             raise ValueError(f"expected {len(blocks[0])} rows in Jacobian {i}, found shape {block.shape}")
         H[i] = block
-
-
-def spacing_factors(
-    control_keys: Sequence[int], nominal: Array, sigma: Array, periodic: bool
-) -> list[gtsam.RangeFactor2]:
-    """Build GTSAM's range factors `|c_{j+1} - c_j| - nominal_j` between neighbours.
-
-    nominal and sigma are in m and have k - 1 entries, or k if periodic. See `residuals.pair_residuals`.
-    """
-    expected = len(control_keys) - (0 if periodic else 1)
-    if not len(nominal) == len(sigma) == expected:
-        raise ValueError(f"expected {expected} distances and sigmas, found {len(nominal)} and {len(sigma)}")
-    following = [*control_keys[1:], control_keys[0]]
-    return [
-        gtsam.RangeFactor2(first, second, float(d), gtsam.noiseModel.Isotropic.Sigma(1, float(s)))
-        for first, second, d, s in zip(control_keys, following, nominal, sigma, strict=False)
-    ]
 
 
 def smoothness_factors(

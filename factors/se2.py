@@ -40,10 +40,10 @@ def rotated(covariances: Array, theta: Array) -> Array:
 
 
 def left_of(vectors: Array) -> Array:
-    """Turn vectors (n, 2) by a quarter to the left: (x, y) becomes (-y, x)."""
+    """Turn vectors (..., 2) by a quarter to the left: (x, y) becomes (-y, x)."""
     turned = np.empty_like(vectors)
-    turned[:, 0] = -vectors[:, 1]
-    turned[:, 1] = vectors[:, 0]
+    turned[..., 0] = -vectors[..., 1]
+    turned[..., 1] = vectors[..., 0]
     return turned
 
 

@@ -43,6 +43,7 @@ GROUPS: Final = {
         "online": Entry("runs:Online", "estimate", "Map a log online, cycle by cycle."),
         "batch": Entry("runs:Batch", "estimate", "Optimize whole logs at once, as the ground reference."),
         "plot": Entry("runs:Plot", "plot", "Draw a map with its uncertainty band."),
+        "view": Entry("runs:View", "view", "Write a result as a page for any browser."),
         "export": Entry("runs:Export", "export", "Write a map as planners and other tools read it."),
     },
     "Data": {
@@ -60,6 +61,7 @@ GROUPS: Final = {
 EXTRAS: Final = {  # packages that the core does without, and the extra that has them
     **dict.fromkeys(("tabulate", "matplotlib"), "eval"),
     "distributed": "cluster",
+    "bokeh": "page",
 }
 COMMANDS: Final = {name: command for group in GROUPS.values() for name, command in group.items()}
 
@@ -78,10 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         message = str(error) if isinstance(error, PathspaceError) else f"{error!s:.{MOST_SAID}}"
         return _refuse(message, words, NOT_SOLVED if isinstance(error, SolveError) else BAD_INPUT)
     except ModuleNotFoundError as error:
-        if error.name not in EXTRAS:
+        package = str(error.name).partition(".")[0]
+        if package not in EXTRAS:
             raise
-        way = install(EXTRAS[error.name])
-        return _refuse(f"expected the package {error.name} ({way}), found none", words)
+        return _refuse(f"expected the package {package} ({install(EXTRAS[package])}), found none", words)
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import timedelta
 from enum import IntEnum
+from importlib.util import find_spec
 from typing import Final
 
 from rich.console import Console
@@ -61,16 +62,20 @@ def say(*lines: str, console: Console | None = None) -> None:
 def progress(description: str, total: int | None = None, lines: int = 0) -> "Iterator[Steps]":
     """Show a bar on a terminal, or a spinner without a total, and yield what counts the steps.
 
-    Without a terminal nothing is shown, unless `lines` asks for about that many lines.
+    A notebook shows the same bar with ipywidgets, and lines without. Elsewhere nothing is shown, unless
+    `lines` asks for about that many lines.
     """
     level, console = VERBOSITY.get(), Console(stderr=True, highlight=False)
     lines = {Verbosity.QUIET: 0, Verbosity.VERBOSE: LINES}.get(level, lines)
+    has_bar = console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
+    if console.is_jupyter and not has_bar and level != Verbosity.QUIET:
+        lines = lines or LINES
     text, remaining = (
         TextColumn(f"{{task.{name}}}", markup=False) for name in ("description", "fields[remaining]")
     )
     columns = (SpinnerColumn(), text, BarColumn(), MofNCompleteColumn(), remaining)
     shown = columns if total is not None or lines else columns[:2]
-    hidden = level == Verbosity.QUIET or not console.is_terminal
+    hidden = level == Verbosity.QUIET or not has_bar
     with Progress(*shown, console=console, transient=True, disable=hidden) as display:
         yield Steps(display, description, total, lines)
 
@@ -90,17 +95,13 @@ class Steps:
         self._total = self._total if total is None else total
         remaining = ""
         if self._total is not None:
-            remaining = time_remaining(time.monotonic() - self._begin, self._done, self._total)
+            remaining = "time left unknown"
+            if self._done:  # by the mean of the steps
+                mean = (time.monotonic() - self._begin) / self._done
+                remaining = f"{timedelta(seconds=round(mean * (self._total - self._done)))} left"
         self._display.update(self._task, completed=self._done, total=self._total, remaining=remaining)
         if self._lines and self._total and not self._display.console.is_terminal:
             interval = -(-self._total // self._lines)
             if self._done % interval == 0 or self._done == self._total:
                 text = f"{self._description}: {self._done} of {self._total}, {remaining}"
                 self._display.console.print(text, markup=False)
-
-
-def time_remaining(elapsed: float, done: int, total: int) -> str:
-    """`elapsed * (total - done) / done` (s) in words."""
-    if not done:
-        return "time left unknown"
-    return f"{timedelta(seconds=round(elapsed * (total - done) / done))} left"

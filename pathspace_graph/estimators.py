@@ -70,10 +70,6 @@ def _baseline(name: str, place: str) -> Elsewhere:
     return Elsewhere(EntryPoint(name, f"{__package__}.baselines.{place}", ONLINE_GROUP))
 
 
-def _spline(settings: MapperSettings, noise: KnownNoise) -> BatchMapper:
-    return BatchMapper(settings, noise, FixedLagMapper)
-
-
 ONLINE: Final[dict[str, MakeOnline]] = {
     **_installed(ONLINE_GROUP),
     DEFAULT_ONLINE: FixedLagMapper,
@@ -84,7 +80,7 @@ ONLINE: Final[dict[str, MakeOnline]] = {
 
 BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
-    DEFAULT_BATCH: _spline,
+    DEFAULT_BATCH: lambda settings, noise: BatchMapper(settings, noise, FixedLagMapper),
     "landmark-batch": _baseline("landmark-batch", "landmark_batch:LandmarkBatch"),
 }
 

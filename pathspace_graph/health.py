@@ -71,25 +71,29 @@ class HealthMonitor(Copyable):
     def update(self, evidence: Evidence) -> Health:
         if self._recent and self._recent[-1].closed != evidence.closed:
             self.restart()
-        self._remember(evidence)
+        recent = self._recent
+        recent.append(evidence)
+        self._offered += evidence.offered
+        if evidence.offered or evidence.rests or self._last_offered is None:
+            self._last_offered = evidence.t
+        while recent[0].t <= evidence.t - WINDOW and self._offered - recent[0].offered >= MIN_OFFERED:
+            self._offered -= recent.popleft().offered
         offered, explained, used, squares = self._offered, 0, 0, 0.0
-        for one in self._recent:
+        for one in recent:
             explained, used, squares = explained + one.explained, used + one.used, squares + one.innovations
         share = explained / offered if offered >= MIN_OFFERED else 1.0
         innovation = squares / used if used >= MIN_OFFERED else 0.0
-        cones = max(used / len(self._recent), 1.0)  # cycles repeat the errors of the same cones
+        cones = max(used / len(recent), 1.0)  # cycles repeat the errors of the same cones
         most = MAX_INNOVATION * (1.0 + (2.0 / cones) ** 0.5)
         health = self._judge(evidence, share, innovation, most)
-        return self._beside_gap(offered) if health == Health(GOOD) else health
-
-    def _beside_gap(self, offered: int) -> Health:
-        """Return the health of a good estimate, which is degraded beside a gap of a boundary."""
-        unmapped = [*map(sum, zip(*[one.unmapped for one in self._recent], strict=True))]
+        if health != Health(GOOD):
+            return health
+        unmapped = [*map(sum, zip(*[one.unmapped for one in recent], strict=True))]
         most = (1.0 - SHARE_DEGRADED) * (offered + sum(unmapped))
-        names = [NAMES[label] for label in BOUNDARIES if unmapped[label] > most]
+        names = [NAMES[label] for label in BOUNDARIES if unmapped[label] > most]  # beside a gap
         if len(names) == len(BOUNDARIES):
             return Health(DEGRADED, "no boundary is mapped here")
-        return Health(DEGRADED, f"the {names[0]} boundary is not mapped here") if names else Health(GOOD)
+        return Health(DEGRADED, f"the {names[0]} boundary is not mapped here") if names else health
 
     def _wrong_side(self) -> str:
         """Name a wrong boundary, if the other one explains its detections, or was the last to do so."""
@@ -106,17 +110,6 @@ class HealthMonitor(Copyable):
         if offered < MIN_OFFERED / len(BOUNDARIES):
             return None
         return explained >= SHARE_DEGRADED * offered
-
-    def _remember(self, evidence: Evidence) -> None:
-        recent = self._recent
-        recent.append(evidence)
-        self._offered += evidence.offered
-        if evidence.offered or evidence.rests or self._last_offered is None:
-            self._last_offered = evidence.t
-        while recent[0].t <= evidence.t - WINDOW:
-            if self._offered - recent[0].offered < MIN_OFFERED:
-                return
-            self._offered -= recent.popleft().offered
 
     def _judge(self, newest: Evidence, share: float, innovation: float, most: float) -> Health:
         lost = SHARE_LOST if newest.closed else 0.0  # on an open map dead reckoning suffices

@@ -33,9 +33,13 @@ class LapCounter:
         if self._last is not None:
             self._path += float(np.hypot(x - self._last[0], y - self._last[1]))
             self._farthest = max(self._farthest, float(np.hypot(x, y)))
-            if self._has_driven_a_lap() and self._passes_the_line(x, y, theta):
-                self.lap += 1
-                self._path = self._farthest = 0.0
+            if x >= 0.0 and self._has_driven_a_lap() and self._heads_forward(theta):
+                last_x, last_y, _ = self._last
+                crossing_y = last_y + (y - last_y) * last_x / (last_x - x) if last_x < 0.0 else np.inf
+                behind = x <= LINE_DEPTH and abs(y) <= LINE_HALF_WIDTH
+                if behind or abs(crossing_y) <= LINE_HALF_WIDTH:
+                    self.lap += 1
+                    self._path = self._farthest = 0.0
         self._last = (x, y, theta)
         return self.lap
 
@@ -57,15 +61,6 @@ class LapCounter:
 
     def _heads_forward(self, theta: float) -> bool:
         return bool(np.cos(theta) > np.cos(LINE_HEADING))
-
-    def _passes_the_line(self, x: float, y: float, theta: float) -> bool:
-        assert self._last is not None
-        if x < 0.0 or not self._heads_forward(theta):
-            return False
-        last_x, last_y, _ = self._last
-        crossing_y = last_y + (y - last_y) * last_x / (last_x - x) if last_x < 0.0 else np.inf
-        behind = x <= LINE_DEPTH and abs(y) <= LINE_HALF_WIDTH
-        return bool(behind or abs(crossing_y) <= LINE_HALF_WIDTH)
 
 
 def lap_end_indices(poses: NDArray[np.float64]) -> NDArray[np.intp]:

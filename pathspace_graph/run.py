@@ -3,8 +3,8 @@
 import gc
 import time
 from array import array
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from functools import cached_property
@@ -12,10 +12,12 @@ from math import nan
 from operator import methodcaller
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
+import gtsam
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.linear import keys_of_factor
 from pathspace_graph.io.brief import Brief
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
@@ -216,11 +218,22 @@ def timed_wait(estimator: OnlineEstimator) -> float:
     return time.perf_counter() - begin
 
 
+def by_cycle(factors: Iterable[gtsam.NonlinearFactor]) -> Mapping[int, list[gtsam.NonlinearFactor]]:
+    """Return factors by the cycle of their newest pose; those without a pose are of the first cycle."""
+    found = defaultdict[int, list[gtsam.NonlinearFactor]](list)
+    for factor in factors:
+        keys = keys_of_factor(factor).tolist()
+        poses = (gtsam.symbolIndex(key) for key in keys if gtsam.symbolChr(key) == ord("x"))
+        found[max(poses, default=0)].append(factor)
+    return found
+
+
 def timed_update(
-    estimator: OnlineEstimator, odometry: Odometry, detections: Detections
+    estimator: OnlineEstimator, odometry: Odometry, detections: Detections, *factors: Any
 ) -> tuple[CycleResult, float, float]:
+    update: Callable[..., CycleResult] = estimator.update
     worked, begin = time.thread_time(), time.perf_counter()
-    estimate = estimator.update(odometry, detections)
+    estimate = update(odometry, detections, *factors)
     seconds = time.perf_counter() - begin
     return estimate, seconds, time.thread_time() - worked
 
@@ -253,16 +266,63 @@ def run_online(
     `outlines` they have no covariances, which take most of the memory of a long drive. `observers` are called
     after each cycle, and their time is not counted. BLAS runs on one thread. Between cycles the run waits for
     batches, and garbage collection excludes objects older than the run. Estimator and observers see lengths
-    divided by the scale of the log, the result has them in metres of the log.
+    divided by the scale of the log, the result has them in metres of the log. An estimator with a method
+    `factors` gets each of the factors that this returns for the log in the cycle of its newest pose.
     """
     check_type("log", log, Log)
     check_type("estimator", estimator, OnlineEstimator)
-    map_of = outline_of if outlines else methodcaller("map")
-    run = _Run(estimator, map_of, [float(t) for t in snapshot_times], observers)
+    map_of: Callable[[OnlineEstimator], Map] = outline_of if outlines else methodcaller("map")
+    upcoming, snapshots = deque(float(t) for t in snapshot_times), list[Map]()
+    laps, lap_maps, observing, waited = LapCounter(), list[tuple[int, Map]](), 0.0, 0.0
+    poses, records, log_at_one = array("d"), list[CycleRecord](), log.at_scale_one()
+    given = by_cycle(_ask(estimator, "factors", log_at_one) or ())
     with threadpool_limits(limits=1), spared_by_collector():
-        for odometry, detections in split_odometry(log.at_scale_one()):
-            run.cycle(odometry, detections)
-        return scaled(run.result(name), log.scale)
+        for number, (odometry, detections) in enumerate(split_odometry(log_at_one)):
+            while upcoming and upcoming[0] < detections.t:
+                upcoming.popleft()
+                snapshots.append(map_of(estimator))
+            waited += timed_wait(estimator)
+            factors = [given[number]] if number in given else []
+            result, seconds, processor = timed_update(estimator, odometry, detections, *factors)
+            lap_before = laps.lap
+            lap = laps.update(np.asarray(result.pose))
+            if lap > lap_before:
+                lap_maps.append((lap_before, map_of(estimator)))
+            poses.extend(result.pose)
+            cycle = ObservedCycle(estimator, detections, result, number, seconds, lap, processor)
+            records.append(cycle.record)
+            begin = time.perf_counter()
+            for observer in observers:
+                observer(cycle)
+            observing += time.perf_counter() - begin if observers else 0.0
+        snapshots += [map_of(estimator) for _ in upcoming]
+        begin = time.perf_counter()
+        _ask(estimator, "finish")
+        waited += time.perf_counter() - begin
+        track, t = estimator.map(), np.array([record.t for record in records])
+        if laps.last_lap_is_complete:
+            lap_maps.append((laps.lap, track))
+        trajectory, smoothed = np.array(poses).reshape(-1, 3), _ask(estimator, "smoothed", t)
+        smoothed = np.full(3, np.nan) if smoothed is None else smoothed
+        is_smoothed = np.isfinite(smoothed)
+        run = RunResult(
+            estimator=name,
+            settings=settings_dict(estimator.settings),
+            map=track,
+            trajectory_t=t,
+            trajectory=trajectory,
+            cycles=tuple(records),
+            laps=laps.completed,
+            lap_maps=tuple(lap_maps),
+            snapshots=tuple(snapshots),
+            vehicle=_ask(estimator, "vehicle_state") if records else None,
+            observing=observing,
+            batches=_ask(estimator, "batches"),
+            waited=waited,
+            noise=_ask(estimator, "noise_used"),
+            smoothed=np.where(is_smoothed, smoothed, trajectory) if is_smoothed.any() else None,
+        )
+    return scaled(run, log.scale)
 
 
 def solved(solve: Callable[[Log], Result], log: Log) -> Result:
@@ -273,75 +333,6 @@ def solved(solve: Callable[[Log], Result], log: Log) -> Result:
     check_type("log", log, Log)
     with threadpool_limits(limits=1), solving("the batch"):
         return scaled(solve(log.at_scale_one()), log.scale)
-
-
-class _Run:
-    def __init__(
-        self,
-        estimator: OnlineEstimator,
-        map_of: Callable[[OnlineEstimator], Map],
-        times: Sequence[float],
-        observers: Sequence[Observer],
-    ) -> None:
-        self._estimator, self._map_of, self._observers = estimator, map_of, observers
-        self._observing = self._waited = 0.0
-        self._snapshot_times, self._snapshots = deque(times), list[Map]()
-        self._laps, self._lap_maps = LapCounter(), list[tuple[int, Map]]()
-        self._poses, self._records = array("d"), list[CycleRecord]()
-
-    def cycle(self, odometry: Odometry, detections: Detections) -> None:
-        self._take_snapshots(before=detections.t)
-        self._waited += timed_wait(self._estimator)
-        result, seconds, processor = timed_update(self._estimator, odometry, detections)
-        lap_before = self._laps.lap
-        lap = self._laps.update(np.asarray(result.pose))
-        if lap > lap_before:
-            self._lap_maps.append((lap_before, self._map_of(self._estimator)))
-        self._poses.extend(result.pose)
-        number = len(self._records)
-        cycle = ObservedCycle(self._estimator, detections, result, number, seconds, lap, processor)
-        self._records.append(cycle.record)
-        begin = time.perf_counter()
-        for observer in self._observers:
-            observer(cycle)
-        if self._observers:
-            self._observing += time.perf_counter() - begin
-
-    def result(self, name: str) -> RunResult:
-        self._take_snapshots(before=float("inf"))
-        begin = time.perf_counter()
-        _ask(self._estimator, "finish")
-        self._waited += time.perf_counter() - begin
-        estimator, records, track = self._estimator, self._records, self._estimator.map()
-        if self._laps.last_lap_is_complete:
-            self._lap_maps.append((self._laps.lap, track))
-        t = np.array([record.t for record in records])
-        trajectory = np.array(self._poses).reshape(-1, 3)
-        smoothed = _ask(estimator, "smoothed", t)
-        smoothed = np.full(3, np.nan) if smoothed is None else smoothed
-        is_smoothed = np.isfinite(smoothed)
-        return RunResult(
-            estimator=name,
-            settings=settings_dict(estimator.settings),
-            map=track,
-            trajectory_t=t,
-            trajectory=trajectory,
-            cycles=tuple(records),
-            laps=self._laps.completed,
-            lap_maps=tuple(self._lap_maps),
-            snapshots=tuple(self._snapshots),
-            vehicle=_ask(estimator, "vehicle_state") if records else None,
-            observing=self._observing,
-            batches=_ask(estimator, "batches"),
-            waited=self._waited,
-            noise=_ask(estimator, "noise_used"),
-            smoothed=np.where(is_smoothed, smoothed, trajectory) if is_smoothed.any() else None,
-        )
-
-    def _take_snapshots(self, before: float) -> None:
-        while self._snapshot_times and self._snapshot_times[0] < before:
-            self._snapshot_times.popleft()
-            self._snapshots.append(self._map_of(self._estimator))
 
 
 def settings_dict(settings: Any) -> dict[str, Any]:

@@ -80,16 +80,19 @@ def draw_car(rng: Generator) -> DrawnCar:
 
     The distributions are wider than what the few known cars show.
     """
-    vehicle = draw_vehicle(rng)
-    return DrawnCar(
-        draw_sensor(rng), draw_sensor_faults(rng), draw_odometry(rng), draw_odometry_faults(rng), vehicle
+    # how it drives; it stands still before and after
+    vehicle = VehicleSettings(
+        # a driverless car's first laps have 4 m/s, its best ones 12
+        speed_max=rng.uniform(4.0, 12.0),
+        # the log begins before the car does, and ends after it
+        rest=rng.uniform(0.0, 3.0),
+        stand=rng.uniform(5.0, 8.0),
+        # of the odometry: wheel speeds on a bus at 25 Hz, inertial units at 100
+        rate=rng.uniform(25.0, 100.0),
     )
-
-
-def draw_sensor(rng: Generator) -> SensorSettings:
-    """Draw a detector of cones."""
+    # its detector of cones
     begin = radians(rng.uniform(0.0, 10.0))
-    return SensorSettings(
+    sensor = SensorSettings(
         # front ends run at 10 to 15 Hz; three cameras that share a processor at 5
         rate=rng.uniform(5.0, 15.0),
         # one camera sees 10 to 20 m over 90 to 120 degrees, three cameras 40 m over 130
@@ -124,13 +127,10 @@ def draw_sensor(rng: Generator) -> SensorSettings:
         # nobody has measured the scale of its ranges
         sigma_range_scale=0.0,
     )
-
-
-def draw_sensor_faults(rng: Generator) -> SensorFaults:
-    """Draw constant errors of a detector against the odometry."""
+    # constant errors of the detector against the odometry
     # the sensor of one in four is mounted badly
     yaw = radians(rng.uniform(3.0, 7.0)) if rng.random() < 0.25 else radians(rng.uniform(0.0, 1.5))
-    return SensorFaults(
+    sensor_faults = SensorFaults(
         # stamps of the exposure and of the odometry's receipt make early ones, those of the result late ones
         latency=rng.uniform(-0.15, 0.15),
         # a plate that is mounted by eye is off by a degree; one recorded car's sensor is turned by 6.5
@@ -142,26 +142,20 @@ def draw_sensor_faults(rng: Generator) -> SensorFaults:
         # boxes too small for a colour
         colourless=rng.uniform(0.0, 0.05),
     )
-
-
-def draw_odometry(rng: Generator) -> OdometryNoise:
-    """Draw an odometry between a good INS and wheels with a cheap gyro."""
+    # an odometry between a good INS and wheels with a cheap gyro
     share = rng.random()
     white = np.array(INS.white) ** (1.0 - share) * np.array(OdometryNoise().white) ** share
     slow = np.array(INS.slow) * rng.uniform(0.5, 1.5)
     # scale and bias are those of the faults, so that the log says what was drawn
-    return OdometryNoise(
+    odometry = OdometryNoise(
         white=(float(white[0]), float(white[1]), float(white[2])),
         scale=0.0,
         gyro_bias=0.0,
         slow=(float(slow[0]), float(slow[1]), float(slow[2])),
         slow_time=rng.uniform(2.0, 8.0),
     )
-
-
-def draw_odometry_faults(rng: Generator) -> OdometryFaults:
-    """Draw constant errors of the odometry, and false travel of some."""
-    return OdometryFaults(
+    # constant errors of the odometry, and false travel of some
+    odometry_faults = OdometryFaults(
         # of a wheel's radius, and of a gyro that was averaged at rest for seconds
         speed_scale=rng.normal(0.0, 0.005),
         yaw_rate_bias=rng.normal(0.0, 0.0015),
@@ -169,19 +163,7 @@ def draw_odometry_faults(rng: Generator) -> OdometryFaults:
         false_travel=rng.uniform(0.3, 1.5) * (rng.random() < SOME),
         false_travel_time=rng.uniform(1.0, 4.0),
     )
-
-
-def draw_vehicle(rng: Generator) -> VehicleSettings:
-    """Draw how a vehicle drives, which stands still before and after."""
-    return VehicleSettings(
-        # a driverless car's first laps have 4 m/s, its best ones 12
-        speed_max=rng.uniform(4.0, 12.0),
-        # the log begins before the car does, and ends after it
-        rest=rng.uniform(0.0, 3.0),
-        stand=rng.uniform(5.0, 8.0),
-        # of the odometry: wheel speeds on a bus at 25 Hz, inertial units at 100
-        rate=rng.uniform(25.0, 100.0),
-    )
+    return DrawnCar(sensor, sensor_faults, odometry, odometry_faults, vehicle)
 
 
 def log_uniform(rng: Generator, low: float, high: float) -> float:

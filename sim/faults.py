@@ -8,14 +8,12 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.log import Odometry
-from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.settings.checked import AtLeast0, Checked, Share, Signed
 
-from .curves import arc_lengths
 from .sensor import OdometryNoise, measure_twists
-from .track import Track
+from .track import Track, arc_lengths
 from .vehicle import Drive
 
 
@@ -138,7 +136,22 @@ def measure_odometry(
 ) -> tuple[Odometry, Array]:
     """Measure the twists; also return their scale error (-) and bias (rad/s) (2,)."""
     dt = float(driven.t[:2][-1])
-    wheels = _wheel_twists(driven, faults)
+    wheels = driven.twists.copy()  # which differ from the body's where they slip, miss a start or go on
+    if faults.slip:
+        since = driven.t % faults.slip_every
+        slips = (since < faults.slip_time) & (driven.t >= faults.slip_every)
+        wheels *= 1.0 + faults.slip * slips[:, None] * np.array([1.0, 1.0, 0.0])
+    if faults.dead_band:
+        true, row = driven.twists, np.arange(len(wheels))
+        stood = np.maximum.accumulate(np.where(true.any(axis=1), -1, row))
+        faster = np.hypot(true[:, 0], true[:, 1]) > faults.dead_band
+        is_pulling_off = (stood >= 0) & (np.maximum.accumulate(np.where(faster, row, -1)) <= stood)
+        wheels[is_pulling_off] = 0.0
+    if faults.false_travel:
+        stand = np.flatnonzero(driven.twists.any(axis=1))[-1] + 1
+        slow = np.flatnonzero(driven.twists[:stand, 0] > faults.false_travel)[-1:] + 1
+        end = stand + round(faults.false_travel_time / dt)
+        wheels[int(np.append(slow, stand)[0]) : end, 0] = faults.false_travel
     measured, calibration = measure_twists(wheels, dt, noise, rng)
     constant = np.array([faults.speed_scale, faults.yaw_rate_bias])
     if constant.any():
@@ -147,32 +160,3 @@ def measure_odometry(
     kept = ~_is_during(driven, faults.gap_at * lap, faults.gap)
     kept[0] = True  # the first stamp is the beginning of the log
     return Odometry(driven.t[kept], measured[kept]), calibration + constant
-
-
-def _wheel_twists(driven: Drive, faults: OdometryFaults) -> Array:
-    """Twists (N, 3) of the body, except where the odometry slips, misses a start or reports false travel."""
-    twists = driven.twists.copy()
-    if faults.slip:
-        since = driven.t % faults.slip_every
-        slips = (since < faults.slip_time) & (driven.t >= faults.slip_every)
-        twists *= 1.0 + faults.slip * slips[:, None] * np.array([1.0, 1.0, 0.0])
-    if faults.dead_band:
-        true, row = driven.twists, np.arange(len(twists))
-        stood = np.maximum.accumulate(np.where(true.any(axis=1), -1, row))
-        faster = np.hypot(true[:, 0], true[:, 1]) > faults.dead_band
-        is_pulling_off = (stood >= 0) & (np.maximum.accumulate(np.where(faster, row, -1)) <= stood)
-        twists[is_pulling_off] = 0.0
-    if faults.false_travel:
-        stand = np.flatnonzero(driven.twists.any(axis=1))[-1] + 1
-        slow = np.flatnonzero(driven.twists[:stand, 0] > faults.false_travel)[-1:] + 1
-        dt = float(driven.t[1] - driven.t[0])
-        end = stand + round(faults.false_travel_time / dt)
-        twists[int(np.append(slow, stand)[0]) : end, 0] = faults.false_travel
-    return twists
-
-
-def colours(track: Track, wrong_way: bool) -> IntArray:
-    """Labels (M,) that the cones' colours stand for; the other side's if driven the wrong way."""
-    labels = track.cone_labels
-    changed = wrong_way & np.isin(labels, BOUNDARIES)
-    return np.where(changed, LEFT + RIGHT - labels, labels)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 from numpy.random import Generator
@@ -21,23 +21,30 @@ from pathspace_graph.io.log import (
     ray_covariances,
 )
 from pathspace_graph.io.overrides import leaves
-from pathspace_graph.labels import NAMES, UNKNOWN
+from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.lengths import scaled
 from pathspace_graph.settings.checked import Checked
 
-from .cameras import CAMERA, CAMERA_FAULTS, INS, INS_RATE, DrawnCar, draw_car
+from .cameras import CAMERA, CAMERA_FAULTS, INS, INS_RATE, draw_car
 from .faults import (
     Faults,
     OdometryFaults,
     SensorFaults,
-    colours,
     measure_odometry,
     put_down,
     time_at,
     turned_round,
 )
-from .lines import LINE, LineSensor, LineSettings, as_lines
-from .sensor import FALSE_POSITIVE, ConeSensor, OdometryNoise, SensorSettings
+from .sensor import (
+    FALSE_POSITIVE,
+    LINE,
+    ConeSensor,
+    LineSensor,
+    LineSettings,
+    OdometryNoise,
+    SensorSettings,
+    as_lines,
+)
 from .track import Track, to_map_frame
 from .vehicle import Drive, VehicleSettings, displacements, drive
 
@@ -62,31 +69,19 @@ class SimulationSettings(Checked, group=""):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.draw:
-            self._check_draw()
-        if self.faults.odometry.false_travel and not self.vehicle.stand:
-            raise SettingsError("faults.odometry.false_travel: expected vehicle.stand above 0, found 0")
-
-    def _check_draw(self) -> None:
-        """Raise SettingsError where a group that is drawn is neither the default nor a preset."""
         overrun = self.vehicle.overrun
-        known = {
+        drawn = {  # groups that are drawn, each with its default and its presets
             "sensor": (SensorSettings(), CAMERA, LINE),
             "odometry": (OdometryNoise(), INS),
             "vehicle": (VehicleSettings(overrun=overrun), VehicleSettings(overrun=overrun, rate=INS_RATE)),
             "faults.sensor": (SensorFaults(), CAMERA_FAULTS),
             "faults.odometry": (OdometryFaults(),),
         }
-        for group, values in known.items():
+        for group, values in drawn.items() if self.draw else ():
             if attrgetter(group)(self) not in values:
                 raise SettingsError(f"draw: expected no setting of {group} beside it, since it is drawn")
-
-    def with_car(self, car: DrawnCar) -> Self:
-        """Replace the car by a drawn one."""
-        faults = replace(self.faults, sensor=car.sensor_faults, odometry=car.odometry_faults)
-        vehicle = replace(car.vehicle, overrun=self.vehicle.overrun)
-        changed = replace(self, draw=False, vehicle=vehicle, faults=faults)
-        return replace(changed, sensor=car.sensor, odometry=car.odometry)
+        if self.faults.odometry.false_travel and not self.vehicle.stand:
+            raise SettingsError("faults.odometry.false_travel: expected vehicle.stand above 0, found 0")
 
 
 def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
@@ -99,7 +94,11 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
         raise SettingsError(f"seed: expected at least 0, found {seed}")
     wander_rng, odometry_rng, *sensor_rngs, car_rng = np.random.default_rng(seed).spawn(5)
     if settings.draw:
-        drawn = settings.with_car(draw_car(car_rng))
+        car = draw_car(car_rng)
+        wrong = replace(settings.faults, sensor=car.sensor_faults, odometry=car.odometry_faults)
+        vehicle = replace(car.vehicle, overrun=settings.vehicle.overrun)
+        changed = replace(settings, draw=False, vehicle=vehicle, faults=wrong)
+        drawn = replace(changed, sensor=car.sensor, odometry=car.odometry)
         return _as_recorded(simulate(track, drawn, seed), drawn)
     faults, sensor = settings.faults, settings.sensor
     track = to_map_frame(turned_round(track) if faults.vehicle.wrong_way else track)
@@ -112,14 +111,19 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
     poses = _poses_at(driven, stamps)
     poses[:, 2] = np.pi - (np.pi - poses[:, 2]) % (2 * np.pi)
     errors = np.array([getattr(faults.sensor, name) for name in SENSOR])
+    noise, slow = None, [sensor.slow_range, sensor.slow_bearing, sensor.slow_time]
+    if any(settings.odometry.slow) or any(slow[:2]):  # else all of it is white
+        noise = np.array([*settings.odometry.drift_sigmas(1.0 / settings.vehicle.rate), *slow])
     truth = Truth(
         *(stamps, poses, seen.cones, seen.cone_labels),
         associations=None if settings.line.spacing else associations,
         calibration=calibration,
         sensor=errors if errors.any() else None,
-        noise=_noise(settings),
+        noise=noise,
         bend=np.array([sensor.range_bend, sensor.range_bend_from]) if sensor.range_bend else None,
     )
+    defaults = leaves(SimulationSettings())
+    stated = {name: str(value) for name, value in leaves(settings).items() if value != defaults[name]}
     log = Log(
         odometry=odometry,
         cycles=tuple(cycles),
@@ -130,7 +134,7 @@ def simulate(track: Track, settings: SimulationSettings, seed: int) -> Log:
             kind="line" if settings.line.spacing else None,
             sigma_range_scale=sensor.sigma_range_scale or None,
         ),
-        source=_source(track, settings, seed),
+        source={"track": track.name, "seed": str(seed), **stated},
         truth=truth,
     )
     return scaled(log, settings.scale)
@@ -149,29 +153,13 @@ def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
         log,
         cycles=tuple(cycles),
         odometry_sigma=np.array(SIGMA_ODOMETRY),
-        sensor=SensorInfo(),
+        sensor=SensorInfo(kind=log.sensor.kind),
         source={**log.source, "draw": "True"},
         odometry_stated=False,
         detections_stated=False,
         odometry_drift=None,
         truth=truth,
     )
-
-
-def _noise(settings: SimulationSettings) -> Array | None:
-    """Noise (6,) in the order of `io.log_files:TRUE_ERRORS`, or None where all of it is white."""
-    odometry, sensor = settings.odometry, settings.sensor
-    if not (any(odometry.slow) or sensor.slow_range or sensor.slow_bearing):
-        return None
-    drift = odometry.drift_sigmas(1.0 / settings.vehicle.rate)
-    return np.array([*drift, sensor.slow_range, sensor.slow_bearing, sensor.slow_time])
-
-
-def _source(track: Track, settings: SimulationSettings, seed: int) -> dict[str, str]:
-    """Track, seed, and each setting that isn't the default."""
-    defaults = leaves(SimulationSettings())
-    changed = {name: str(value) for name, value in leaves(settings).items() if value != defaults[name]}
-    return {"track": track.name, "seed": str(seed), **changed}
 
 
 def _perceive(
@@ -187,7 +175,9 @@ def _perceive(
     A lap is `lap` m long.
     """
     faults, rate = settings.faults.sensor, settings.sensor.rate
-    labels = colours(track, settings.faults.vehicle.wrong_way)
+    labels = track.cone_labels
+    if settings.faults.vehicle.wrong_way:  # cones keep their colour, which is the other side's then
+        labels = np.where(np.isin(labels, BOUNDARIES), LEFT + RIGHT - labels, labels)
     sensor = (
         LineSensor(track, labels, settings.sensor, settings.line, sensor_rng)
         if settings.line.spacing

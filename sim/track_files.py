@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.io import parsing as limits
 from pathspace_graph.io.parsing import Table, is_number, parse_yaml, read_text, shown, typed
 from pathspace_graph.io.tables import read_table
 from pathspace_graph.labels import BIG_ORANGE, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
-from .curves import arc_lengths, direction, left_normals, resample, ring, unit
-from .track import Track
+from .track import Track, arc_lengths, direction, resample, ring, unit
 
 MIN_CONES: Final = 3  # least number of cones of a boundary
 REPEAT_DISTANCE: Final = 0.01  # distance below which a cone of an ordered row is the one before again (m)
@@ -232,7 +232,7 @@ def _tum(table: Table) -> Track:
     s = np.linspace(0.0, knots[-1], math.ceil(knots[-1] / WIDTH_STEP), endpoint=False)
     points, tangents = np.asarray(spline(s)), unit(np.asarray(spline(s, 1)))
     edges = (
-        points + side * left_normals(tangents) * np.interp(s, knots, circuit[:, k])[:, None]
+        points + side * left_of(tangents) * np.interp(s, knots, circuit[:, k])[:, None]
         for side, k in ((-1.0, 2), (1.0, 3))
     )
     right, left = (resample(edge, 5.0, closed=True)[0] for edge in edges)
@@ -289,7 +289,7 @@ def driving_order(left: Array, right: Array, gate: Array, start: Array) -> Drivi
 def _order(left: Array, right: Array, gate: Array, start: Array) -> DrivingOrder | None:
     step = gate - start[:2]
     # gate cones stand in for missing ones near the start
-    near, side = np.linalg.norm(step, axis=1) < 12.0, step @ left_normals(direction(start[2]))
+    near, side = np.linalg.norm(step, axis=1) < 12.0, step @ left_of(direction(start[2]))
     gate_left, gate_right = gate[near & (side > 0)], gate[near & (side <= 0)]
     points = np.vstack([left, gate_left, right, gate_right])
     split, right_end = len(left) + len(gate_left), len(left) + len(gate_left) + len(right)
@@ -322,7 +322,7 @@ def _first_rung(points: Array, split: int, apexes: Apexes, start: Array) -> Rung
     """Nearest rung across the start's heading, its left cone on the left."""
     rungs = np.array([edge for edge in apexes if edge[0] < split <= edge[1]], dtype=int).reshape(-1, 2)
     step, heading = points[rungs] - start[:2], direction(start[2])
-    along, across = step @ heading, step @ left_normals(heading)
+    along, across = step @ heading, step @ left_of(heading)
     crossing = (across[:, 0] > 0) & (across[:, 1] < 0)
     crossing &= np.linalg.norm(step[:, 0] - step[:, 1], axis=1) < RUNG_MAX
     if not crossing.any():

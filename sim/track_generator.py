@@ -10,23 +10,24 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.settings.checked import AtLeast0, Checked
 
-from . import curves
-from .curves import arc_lengths, left_normals, ring, unit
-from .track import Track
+from .track import (
+    SMOOTHING,
+    STEP,
+    Track,
+    along_polyline,
+    arc_lengths,
+    curvature,
+    ring,
+    unit,
+)
 
 MAX_ATTEMPTS: Final = 500  # two in three keep the default rules; contradicting ones fail them all
+CONE_GAPS: Final = 1.0, 5.0  # least and greatest distance of cones along a row (m)
 STRAIGHT_RADIUS: Final = 150.0  # radius above which a stretch is straight (m)
-CORNER_RADIUS: Final = 8.0  # radius at which cones stand twice as close as on straights (m)
-CORNER_BLUR: Final = 2.0  # sigma (m) by which corners draw cones closer before and after
-MIN_CONE_GAP: Final = 1.0  # least distance of cones along a row (m)
-CONE_GAP_MAX: Final = 5.0  # greatest one (m); they stand closer in corners
-STRAIGHT_MAX: Final = 80.0  # greatest length of a straight (m)
 HAIRPIN_DIAMETER: Final = 9.0  # least outside diameter of a corner (m)
-HAIRPIN_INWARD: Final = 0.3  # probability that a hairpin of the layout points to its inside
-SLALOM_PROBABILITY: Final = 0.35  # that a straight that is long enough becomes a slalom
-CHICANE_PROBABILITY: Final = 0.3  # that it becomes a chicane
 
 
 @dataclass(frozen=True)
@@ -101,14 +102,19 @@ def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _
     radii = least + rng.gamma(2.0, 4.0, count)
     layout: _Layout | None = _Layout(corners, radii)
     for leg in legs:
-        inward = rng.random() < HAIRPIN_INWARD
+        inward = rng.random() < 0.3
         if layout is not None:
             layout = _with_hairpin(layout, float(-leg if inward else leg), least, rng)
     if layout is None:
         return None
     if rng.random() < 0.5:
         layout = _Layout(layout.corners[::-1], layout.radii[::-1])
-    return _rounded(layout, least)
+    half_turn = np.abs(_turns(layout.corners)) / 2
+    before = np.linalg.norm(layout.corners - np.roll(layout.corners, 1, axis=0), axis=1)
+    # both corners of a side may take half of it
+    room = np.minimum(before, np.roll(before, -1)) / 2
+    radii = np.minimum(layout.radii, room / np.maximum(np.tan(half_turn), np.finfo(float).eps))
+    return _Layout(layout.corners, radii) if (radii >= least - 1e-9).all() else None
 
 
 def _with_hairpin(layout: _Layout, leg: float, least: float, rng: Generator) -> _Layout | None:
@@ -129,15 +135,6 @@ def _with_hairpin(layout: _Layout, leg: float, least: float, rng: Generator) -> 
     finger = np.array([foot[0], tip[0], tip[1], foot[1]])
     corners = np.insert(layout.corners, side + 1, finger, axis=0)
     return _Layout(corners, np.insert(layout.radii, side + 1, [bend, radius, radius, bend]))
-
-
-def _rounded(layout: _Layout, least: float) -> _Layout | None:
-    half_turn = np.abs(_turns(layout.corners)) / 2
-    before = np.linalg.norm(layout.corners - np.roll(layout.corners, 1, axis=0), axis=1)
-    # both corners of a side may take half of it
-    room = np.minimum(before, np.roll(before, -1)) / 2
-    radii = np.minimum(layout.radii, room / np.maximum(np.tan(half_turn), np.finfo(float).eps))
-    return _Layout(layout.corners, radii) if (radii >= least - 1e-9).all() else None
 
 
 def _turns(corners: Array) -> Array:
@@ -161,17 +158,15 @@ def _curve(layout: _Layout, rng: Generator) -> Array:
         pieces.append(_arc(end, direction, radii[following], turns[following]))
     polyline = ring(np.vstack(pieces))
     s = arc_lengths(polyline)
-    even = np.linspace(0.0, s[-1], int(s[-1] / curves.STEP), endpoint=False)
-    curve = curves.along_polyline(even, s, polyline)
-    return np.asarray(
-        scipy.ndimage.gaussian_filter1d(curve, curves.SMOOTHING / curves.STEP, axis=0, mode="wrap")
-    )
+    even = np.linspace(0.0, s[-1], int(s[-1] / STEP), endpoint=False)
+    curve = along_polyline(even, s, polyline)
+    return np.asarray(scipy.ndimage.gaussian_filter1d(curve, SMOOTHING / STEP, axis=0, mode="wrap"))
 
 
 def _arc(begin: Array, direction: Array, radius: float, turn: float) -> Array:
     """Samples of an arc from `begin` on, first along `direction`."""
-    angles = turn * np.linspace(0.0, 1.0, max(int(radius * abs(turn) / curves.STEP), 1), endpoint=False)
-    normal = left_normals(direction) * np.sign(turn)
+    angles = turn * np.linspace(0.0, 1.0, max(int(radius * abs(turn) / STEP), 1), endpoint=False)
+    normal = left_of(direction) * np.sign(turn)
     forward, sideways = np.sin(np.abs(angles))[:, None], 1 - np.cos(angles)[:, None]
     return np.asarray(begin + radius * (forward * direction + sideways * normal))
 
@@ -179,16 +174,16 @@ def _arc(begin: Array, direction: Array, radius: float, turn: float) -> Array:
 def _straight(begin: Array, end: Array, rng: Generator) -> Array:
     """Samples from `begin` to `end`, by chance with a slalom or a chicane where there is room."""
     length = float(np.linalg.norm(end - begin))
-    if length < curves.STEP:
+    if length < STEP:
         return begin[None]
-    along = np.arange(0.0, length, curves.STEP)
+    along = np.arange(0.0, length, STEP)
     direction = (end - begin) / length
     dice, offset = rng.random(), np.zeros_like(along)
-    if dice < SLALOM_PROBABILITY:
+    if dice < 0.35:
         offset = _slalom(along, length, rng)
-    elif dice - SLALOM_PROBABILITY < CHICANE_PROBABILITY:
+    elif dice - 0.35 < 0.3:
         offset = _chicane(along, length, rng)
-    return begin + along[:, None] * direction + offset[:, None] * left_normals(direction)
+    return begin + along[:, None] * direction + offset[:, None] * left_of(direction)
 
 
 def _slalom(along: Array, length: float, rng: Generator) -> Array:
@@ -223,18 +218,18 @@ def _keeps_rules(curve: Array, width: float, settings: TrackGeneratorSettings) -
     bend, distance = np.abs(_curvature(curve)), width + settings.separation
     pairs = scipy.spatial.KDTree(curve).query_pairs(distance, output_type="ndarray")
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
-    apart = np.minimum(apart, len(curve) - apart) * curves.STEP  # samples that are near are of one stretch
+    apart = np.minimum(apart, len(curve) - apart) * STEP  # samples that are near are of one stretch
     return bool(
         settings.lap_length[0] <= arc_lengths(ring(curve))[-1] <= settings.lap_length[1]
         and bend.max() * _least_radius(width) <= 1
-        and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * curves.STEP <= STRAIGHT_MAX
+        and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * STEP <= 80.0  # m
         and (apart < np.pi * distance / 2).all()
     )
 
 
 def _curvature(curve: Array) -> Array:
     after, before = np.roll(curve, -1, axis=0), np.roll(curve, 1, axis=0)
-    return curves.curvature((after - before) / 2, after - 2 * curve + before)
+    return curvature((after - before) / 2, after - 2 * curve + before)
 
 
 def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
@@ -251,27 +246,29 @@ def _with_cones(curve: Array, width: float, settings: TrackGeneratorSettings, rn
     first, run = _longest_run(np.abs(_curvature(curve)) < 1 / STRAIGHT_RADIUS)
     curve = np.roll(curve, -(first + run // 3), axis=0)
     along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
-    normals = left_normals(unit(along))
-    crowding = 1 + CORNER_RADIUS * scipy.ndimage.gaussian_filter1d(
-        np.abs(_curvature(curve)), CORNER_BLUR / curves.STEP, mode="wrap"
-    )
+    normals = left_of(unit(along))
+    # at a radius of 8 m cones stand twice as close as on straights
+    crowding = 1 + 8.0 * scipy.ndimage.gaussian_filter1d(np.abs(_curvature(curve)), 2.0 / STEP, mode="wrap")
     rows = [curve + side * normals * width / 2 for side in (1.0, -1.0)]
-    gap = _straight_gap(rows, crowding, settings)
-    left, right = (_place_cones(row, _cumulative(row, gap, crowding), rng) for row in rows)
-    start = np.append(curve[0], np.arctan2(along[0, 1], along[0, 0]))
-    return Track(left, right, np.zeros((0, 2)), True, start, "generated")
 
-
-def _straight_gap(rows: list[Array], crowding: Array, settings: TrackGeneratorSettings) -> float:
     def excess(gap: float) -> float:
         return float(sum(_cumulative(row, gap, crowding)[-1] for row in rows)) - settings.cones
 
-    widest = CONE_GAP_MAX * float(crowding.max())
+    widest = CONE_GAPS[1] * float(crowding.max())
     if excess(widest) >= 0:
-        return widest
-    if excess(MIN_CONE_GAP) <= 0:
-        return MIN_CONE_GAP
-    return float(scipy.optimize.brentq(excess, MIN_CONE_GAP, widest))
+        gap = widest
+    elif excess(CONE_GAPS[0]) <= 0:
+        gap = CONE_GAPS[0]
+    else:
+        gap = float(scipy.optimize.brentq(excess, CONE_GAPS[0], widest))
+    placed = list[Array]()  # with a random offset along each row
+    for row in rows:
+        total = _cumulative(row, gap, crowding)
+        count = int(np.ceil(total[-1]))
+        at = (np.arange(count) + rng.random()) * total[-1] / count
+        placed.append(along_polyline(at, total, ring(row)))
+    start = np.append(curve[0], np.arctan2(along[0, 1], along[0, 0]))
+    return Track(placed[0], placed[1], np.zeros((0, 2)), True, start, "generated")
 
 
 def _cumulative(row: Array, gap: float, crowding: Array) -> Array:
@@ -279,12 +276,5 @@ def _cumulative(row: Array, gap: float, crowding: Array) -> Array:
 
     They are `gap` (m) apart where nothing crowds them.
     """
-    density = 1.0 / np.clip(gap / crowding, MIN_CONE_GAP, CONE_GAP_MAX)
+    density = 1.0 / np.clip(gap / crowding, *CONE_GAPS)
     return np.concatenate([[0.0], np.cumsum(np.diff(arc_lengths(ring(row))) * density)])
-
-
-def _place_cones(row: Array, total: Array, rng: Generator) -> Array:
-    """Place cones (k, 2) along a closed row by their cumulative number, with a random offset."""
-    count = int(np.ceil(total[-1]))
-    at = (np.arange(count) + rng.random()) * total[-1] / count
-    return curves.along_polyline(at, total, ring(row))

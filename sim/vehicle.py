@@ -11,10 +11,10 @@ from numpy.random import Generator
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.settings.checked import AtLeast0, Checked, Signed
 
-from .curves import SmoothCurve, arc_lengths, curvature, direction, left_normals
-from .track import Track
+from .track import SmoothCurve, Track, arc_lengths, curvature, direction
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -136,7 +136,7 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
 def _settling(line: SmoothCurve, start: float, pose: Array, s: Array, settings: VehicleSettings) -> Array:
     """Lateral offset (n,) that begins with the start pose's offset and slope and dies away."""
     point, tangent = line.points(np.array([start]))[0], line.tangents(np.array([start]))[0]
-    normal = left_normals(tangent)
+    normal = left_of(tangent)
     offset = float(normal @ (pose[:2] - point))
     heading = direction(pose[2])
     stretch = 1.0 - line.curvatures(np.array([start]))[0] * offset

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import os
+from types import SimpleNamespace
 
 import pytest
 
-from pathspace_graph.console import progress, say, time_remaining
+from pathspace_graph.console import progress, say
 
 
-def test_the_time_that_remains_is_that_of_the_mean_step() -> None:
-    assert time_remaining(30.0, 0, 4) == "time left unknown"
-    assert time_remaining(30.0, 1, 4) == "0:01:30 left"
-    assert time_remaining(30.0, 4, 4) == "0:00:00 left"
+def test_the_time_that_remains_is_that_of_the_mean_step(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter((0.0, 30.0, 30.0, 30.0))
+    monkeypatch.setattr("pathspace_graph.console.time", SimpleNamespace(monotonic=lambda: next(clock)))
+    with progress("cells", 4, lines=4) as advance:
+        for done in (0, 1, 4):
+            advance(done)
+    told = [line.split(", ")[1] for line in capsys.readouterr().err.splitlines()]
+    assert told == ["time left unknown", "0:01:30 left", "0:00:00 left"]
 
 
 def test_without_a_terminal_only_the_lines_that_were_asked_for_are_written(

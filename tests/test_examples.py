@@ -55,9 +55,11 @@ def test_gnss_holds_the_vehicle_where_cones_let_it_drift() -> None:
 
 @pytest.mark.slow
 def test_a_boundary_passes_through_the_surveyed_point() -> None:
-    without, with_survey = example("surveyed_point").main()
-    assert with_survey < 0.2
-    assert with_survey < 0.15 * without
+    """Curves of few knots pass cones by a decimetre or two, the surveyed one as well."""
+    without, with_survey, in_batch = example("surveyed_point").main()
+    assert with_survey < 0.3
+    assert with_survey < 0.2 * without
+    assert in_batch < 0.06  # samples of the curve are 0.08 m apart
 
 
 def test_the_graph_can_be_looked_at(tmp_path: Path) -> None:

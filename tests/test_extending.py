@@ -19,6 +19,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph import FixedLagMapper, Log, Odometry
+from pathspace_graph.graph.exchange import read_graph
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Variables, pose_keys
 from pathspace_graph.graph.window import WindowFactors
@@ -306,3 +307,40 @@ def test_the_new_estimator_is_scaled(installed: Path) -> None:
     run_command(installed, "scale --out scaling --quick --estimators dead-reckoning")
     rows = csv_rows(installed / "scaling" / "points.csv")
     assert {row["estimator"] for row in rows} == {"dead-reckoning"}
+
+
+# --- a factor of one's own in every estimator ------------------------------------------------------------
+
+COMPASS_POINTS = """[pathspace_graph.online]
+compass-fixed-lag = compass_mappers:CompassFixedLag
+[pathspace_graph.batch]
+compass-batch = compass_mappers:CompassBatch
+"""
+COMPASS_STUDY = """estimators = ["fixed-lag", "compass-fixed-lag", "spline", "compass-batch"]
+tracks = ["round.csv"]
+laps = 1
+metrics = ["ate"]
+"""
+
+
+@pytest.mark.slow
+def test_a_compass_is_ablated_and_in_the_graph(tmp_path: Path, log: Log) -> None:
+    info = tmp_path / "compass_mappers-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: compass-mappers\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(COMPASS_POINTS)
+    for name in ("compass", "compass_mappers"):
+        shutil.copy(EXTENDING / f"{name}.py", tmp_path)
+    (tmp_path / "study.toml").write_text(COMPASS_STUDY)
+    write_round_track(tmp_path)
+    run_command(tmp_path, "ablate study.toml --out study --jobs 1")
+    rows = {row["estimator"]: row for row in csv_rows(tmp_path / "study" / "results.csv")}
+    assert not any(row["failure"] for row in rows.values())
+    for without, with_it in (("fixed-lag", "compass-fixed-lag"), ("spline", "compass-batch")):
+        assert float(rows[with_it]["ate"]) < 0.8 * float(rows[without]["ate"])
+    write_log(log, tmp_path / "log")
+    sizes = []
+    for name in ("spline", "compass-batch"):
+        run_command(tmp_path, f"batch log --out {name} --estimator {name} --graph")
+        sizes.append(read_graph(tmp_path / name / "graph.json")[0].size())
+    assert sizes[1] - sizes[0] == len(log.cycles)

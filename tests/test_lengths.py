@@ -36,7 +36,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from .scenes.drives import short_drive
 from .scenes.paths import modules
 
-CLOSE = 1e-9
+CLOSE = 1e-7  # of rounding, which the first steps of an optimum amplify
 """Results agree to this share of the map's size."""
 
 

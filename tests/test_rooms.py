@@ -19,10 +19,11 @@ EXTRAS = {"distributed", "rerun", "rosbags", "builtin_interfaces"} | ROS
 LATE = {
     "commands.estimate": {"eval.view.recording", "commands.plot"},
     "options.runs": {"io.overrides"},
-    "io.brief": {"eval.figures.map_plot", "frames"},
+    "io.brief": {"eval.figures.map_plot", "eval.figures.notebook", "frames"},
+    "settings.checked": {"io.brief"},
 }
 """Modules that are imported by name when needed, since matplotlib is slow."""
-ASKED = {"io.brief"}
+ASKED = {"io.brief", "settings.checked"}
 """Modules that import from above by name where a user asks a record for its picture or its frame."""
 
 LEAVES = {"errors", "labels", "console", "lengths", "copies", "provenance"}
@@ -168,9 +169,8 @@ def imported_by(node: ast.AST) -> list[str]:
 # --- names -----------------------------------------------------------------------------------------------
 
 TWICE = {
-    *("Crossing", "Drive", "Table"),
-    *("crossings", "drive", "driving_order", "frame_of", "joint_table", "laps_of", "laps_table"),
-    *("made", "main", "outcomes", "rotations", "seen_from", "thinned"),
+    *("Drive", "Table"),
+    *("drive", "driving_order", "made", "main"),
 }
 """Public functions and classes that still stand in two modules: `main` is an entry point's, the others are
 to be renamed. No name joins them, and a name that stands once is taken off."""

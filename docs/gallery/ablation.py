@@ -11,9 +11,9 @@ from tempfile import mkdtemp
 import numpy as np
 
 from pathspace_graph import write_log
-from pathspace_graph.eval.experiment.plots import plot_differences
 from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.study import Study
+from pathspace_graph.eval.experiment.tables import plot_differences
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 

@@ -10,11 +10,12 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pathspace_graph.baselines.ckf_curves import beyond_end, fit_detections, proximity_chain
+from pathspace_graph.baselines.filters import curvature_weighted_breaks
 from pathspace_graph.factors.residuals import greville, smoothness_matrix
 from pathspace_graph.settings.mapper import CkfSettings
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
-from pathspace_graph.spline.knots import LINEAR_BASELINE, curvature_weighted_breaks, fit_spline, refit
+from pathspace_graph.spline.knots import SAMPLED_WEIGHT, LeastSquares, fit_spline
 
 
 def posterior(spline, seen, sigma_bend, sigma_anchor, sigma_detection=0.3):
@@ -85,7 +86,7 @@ def on_bend(along, inside):
 
 
 along, noise = np.linspace(-18, 0, 13), 0.04 * np.eye(2)
-before = fit_spline(on_bend(along, -0.03 * (along + 18)), 6, periodic=False)
+before, _ = fit_spline(on_bend(along, -0.03 * (along + 18)), 6, periodic=False)
 sigma_before = posterior(before, np.linspace(*before.domain, 12), 0.5, 1.0)
 detections = on_bend(np.array([-5.5, -2.6, 2.2, 4.6, 7.0]), np.array([0.1, 0.25, 0.3, 0.05, 0.2]))
 foot_u = before.foot_points(detections).u
@@ -146,16 +147,18 @@ _ = axes.legend()
 
 # %%
 track = generate_track(np.random.default_rng(3), TrackGeneratorSettings(lap_length=(200, 260)))
-old = fit_spline(np.asarray(track.left), 100, periodic=True)
-points = old.evaluate(old.parameters_at(old.length() * (np.arange(1500) + 0.5) / 1500))
+old, _ = fit_spline(np.asarray(track.left), 100, periodic=True)
+u = old.parameters_at(old.length() * (np.arange(1500) + 0.5) / 1500)
+points = old.evaluate(u)
 
 
 def simplified(baseline):
-    empty = BSpline.periodic_from(curvature_weighted_breaks(old, 32, baseline), np.zeros((32, 2)), old.degree)
-    return empty.with_points(refit(old, empty).new_from_old @ old.distinct_control_points)
+    breaks = curvature_weighted_breaks(old, 32, baseline, *old.domain)
+    empty = BSpline.periodic_from(breaks, np.zeros((32, 2)), old.degree)
+    return empty.with_points(LeastSquares(empty, u, SAMPLED_WEIGHT).solve(points))
 
 
-weighted, uniform = simplified(LINEAR_BASELINE), simplified(1.0)
+weighted, uniform = simplified(0.5), simplified(1.0)
 errors = [np.abs(new.foot_points(points).distance) for new in (weighted, uniform)]
 
 figure, (above, below) = plt.subplots(2, 1, figsize=(7, 6), layout="constrained", height_ratios=(2, 1))

@@ -12,22 +12,22 @@ import pandas as pd
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import check_name
+from pathspace_graph.eval.figures.map_plot import plot_maps
 from pathspace_graph.eval.figures.style import save_figures
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.eval.metrics.measures import METRICS, PAPER
 from pathspace_graph.eval.metrics.summary import has_cones, versions
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.files import atomic_folder, write_json
-from pathspace_graph.io.map import read_map
+from pathspace_graph.io.map import Map, read_map
 from pathspace_graph.io.overrides import Overrides
 from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE
 from pathspace_graph.io.tables import read_trajectory
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .plots import Drawn, plot_maps
 from .run import EstimatorCell, Plan, Record, add_batch, make_plan, run_folder, run_records
-from .statistics import estimate
 from .study import Study, log_folders
-from .tables import Table, write_csv
+from .tables import Table, estimate, write_csv
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
 WITHOUT_TRUTH: Final = (  # metrics that say something of a log without true cones
@@ -199,13 +199,15 @@ def write_comparison(out: Path, comparison: Comparison, jobs: int, *, force: boo
 def _write_log(folder: Path, name: str, comparison: Comparison) -> None:
     """Copy the files of the runs on a log, and draw their maps."""
     folder.mkdir(exist_ok=True)
-    drawn, truth = dict[str, Drawn](), None
+    drawn, truth = dict[str, tuple[Map, Array]](), None
     for names, cell, record in comparison.results:
         if names["log"] != name or record["failure"]:
             continue
         run = shutil.copytree(run_folder(comparison.folder, cell), folder / cell.estimator)
         file = next(run / name for name in (SMOOTHED_FILE, TRAJECTORY_FILE) if (run / name).exists())
-        drawn[cell.estimator] = Drawn(read_map(run), read_trajectory(file)[1], record["rows"][-1])
+        known = [metric for metric in PAPER if record["rows"][-1].get(metric.key) is not None]
+        texts = [f"{m.title} {m.text(record['rows'][-1][m.key])} {m.unit}".strip() for m in known]
+        drawn[f"{cell.estimator}\n{', '.join(texts)}"] = read_map(run), read_trajectory(file)[1]
         truth = cell.drive.load()[0].truth
     if drawn:
         save_figures(folder, {"maps": plot_maps(drawn, truth)})

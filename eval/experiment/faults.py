@@ -12,42 +12,31 @@ from typing import Any, Final, NamedTuple
 import pandas as pd
 
 from pathspace_graph.errors import SettingsError, check_name
-from pathspace_graph.eval.metrics.measures import METRICS, figures
+from pathspace_graph.eval.metrics.measures import METRICS, Metric
 from pathspace_graph.io.files import write_json
 from pathspace_graph.plausibility.diagnosis import PRIOR_LIMIT
 
-from .statistics import RUN, last_laps
 from .study import Study, find_study, read_study_file
-from .tables import Table, write_csv, write_results
+from .tables import RUN, Table, last_laps, write_csv, write_results
 
 CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
-COLUMNS: Final = {  # of the table of faults: value, and digits
-    "runs": ("runs", 0),
-    "failed": ("failed", 0),
-    "rmse by clean": ("ratio_mean", 2),
-    "least": ("ratio_min", 2),
-    "most": ("ratio_max", 2),
-    "size by clean": ("size_ratio", 2),
-    "missed [%]": ("missed", 1),
-    "closed [%]": ("closed", 0),
-    "lost at the end [%]": ("lost", 0),
-    "largest error [m]": ("error_max", 1),
-    "called degraded [%]": ("reported_degraded", 1),
-    "called lost [%]": ("reported_lost", 1),
-    "reported [%]": ("reported", 0),
-    "longest time over 1 m off [s]": ("divergence_time", 1),
-    "longest way over 1 m off [m]": ("divergence_distance", 0),
+FIGURES: Final = {  # of an outcome: metric, ratio or sign of the runs, how it is taken over them, its column
+    "with_map": ("ratio", "count", None),
+    "ratio_mean": ("ratio", "mean", Metric("ratio_mean", "rmse by clean", digits=2)),
+    "ratio_min": ("ratio", "min", Metric("ratio_min", "least", digits=2)),
+    "ratio_max": ("ratio", "max", Metric("ratio_max", "most", digits=2)),
+    "size_ratio": ("size_ratio", "mean", Metric("size_ratio", "size by clean", digits=2)),
+    "missed": ("missed", "mean", Metric("missed", "missed", "%", 1)),
+    "closed": ("closed_at_end", "sum", Metric("closed", "closed", "%", 0)),
+    "lost": ("lost_at_end", "sum", Metric("lost", "lost at the end", "%", 0)),
+    "error_max": ("error_max", "max", Metric("error_max", "largest error", "m", 1)),
+    "reported_degraded": ("reported_degraded", "mean", Metric("degraded", "called degraded", "%", 1)),
+    "reported_lost": ("reported_lost", "mean", Metric("called_lost", "called lost", "%", 1)),
+    "reported": ("reported", "sum", Metric("reported", "reported", "%", 0)),
+    "divergence_time": ("divergence_time", "max", Metric("time", "longest time over 1 m off", "s", 1)),
+    "divergence_distance": ("divergence_distance", "max", Metric("way", "longest way over 1 m off", "m", 0)),
 }
-MEASURED: Final = {  # value of an outcome: metric, ratio or sign of the runs, and how it is taken over them
-    "with_map": ("ratio", "count"),
-    **{f"ratio_{how}": ("ratio", how) for how in ("mean", "min", "max")},
-    **{name: (name, "mean") for name in ("size_ratio", "missed")},
-    **{"closed": ("closed_at_end", "sum"), "lost": ("lost_at_end", "sum")},
-    **{name: (name, "max") for name in ("error_max", "divergence_time", "divergence_distance")},
-    "reported": ("reported", "sum"),
-    **{name: (name, "mean") for name in ("reported_degraded", "reported_lost")},
-}
-COUNTS: Final = ("with_map", "closed", "lost", "reported")
+COUNTS: Final = ("with_map", "closed", "lost", "reported")  # which the table has as shares
 _NAME: Final = re.compile(r"(?P<kind>.+): (?P<value>[-+]?\d+(\.\d+)?)( (?P<unit>\S+))?")
 
 
@@ -103,7 +92,7 @@ def outcomes(study: Study, frame: pd.DataFrame) -> list[dict[str, Any]]:
         fault, runs = fault_of(noise), every[every["noise"] == noise]
         values: dict[str, Any] = {"fault": fault.kind, "strength": fault.value, "unit": fault.unit}
         values |= {"runs": len(runs), "failed": int(failures.get(noise, 0))}
-        values |= {name: float(runs[key].agg(how)) for name, (key, how) in MEASURED.items()}
+        values |= {name: float(runs[key].agg(how)) for name, (key, how, _) in FIGURES.items()}
         values |= {name: int(values[name]) for name in COUNTS}
         sigmas = {key: float(runs[key].astype(float).mean()) for key in runs if key.endswith("_by_prior")}
         titles = {key: METRICS[key].title.removesuffix(" by its prior's sigma") for key in sigmas}
@@ -118,7 +107,7 @@ def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
 
     `ratio` (of rmse) and `size_ratio` are to that run, NaN without a map; `reported`: anything was said.
     """
-    metrics = ["rmse", "size", *(key for key, _ in MEASURED.values() if key in METRICS)]
+    metrics = ["rmse", "size", *(key for key, *_ in FIGURES.values() if key in METRICS)]
     last = last_laps(frame)
     last = last.reindex(columns=[*dict.fromkeys([*last, *metrics])]).astype(dict.fromkeys(metrics, float))
     clean = last[last["noise"] == CLEAN].set_index([*RUN])
@@ -135,11 +124,11 @@ def fault_table(study: Study, found: Sequence[dict[str, Any]], *, notices: bool 
     """
     rows = []
     for noise, values in zip(study.noise, found, strict=True):
-        shares = {name: values[name] / max(values["runs"], 1) for name in COUNTS}
-        known = {**values, **shares}
-        cells = [100.0 * known[key] if "%" in title else known[key] for title, (key, _) in COLUMNS.items()]
-        row = {"fault": noise}
-        row |= dict(zip(COLUMNS, figures(cells, *(digits for _, digits in COLUMNS.values())), strict=True))
+        row = {"fault": noise, "runs": str(values["runs"]), "failed": str(values["failed"])}
+        for name, (*_, column) in FIGURES.items():
+            if column is not None:
+                share = max(values["runs"], 1) if name in COUNTS else 1
+                row[column.heading] = column.text(values[name] / share)
         if notices:
             far = (f"{name} {sigmas:+.1f}" for name, sigmas in values["calibration"].items())
             row["calibration by its prior's sigma"] = ", ".join(far)

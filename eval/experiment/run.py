@@ -6,14 +6,15 @@ import sys
 import tempfile
 import time
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import combinations, product
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import joblib
 import numpy as np
@@ -27,6 +28,7 @@ from pathspace_graph.eval.metrics.alignment import aligned_distance
 from pathspace_graph.eval.metrics.measures import METRICS, measure, online_cycles, stage_times
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times, summarize, versions
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
+from pathspace_graph.io.brief import Brief
 from pathspace_graph.io.files import atomic_folder, check_target, to_plain, write_json, write_text
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
@@ -41,16 +43,13 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import Track
 
 from .provenance import Code, check_code, code_from, code_of, here, identity, made
-from .statistics import RUN, RUN_OF
 from .study import Drive, Study, load_tracks, recorded_drive, simulated_drive, track_digest
+from .tables import RUN, RUN_OF
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
-
-R = TypeVar("R")
-W = TypeVar("W")
 
 CELLS: Final = "cells"  # folder of the kept cells
 STUDY_FILE: Final = "study.json"
@@ -71,11 +70,9 @@ class WorkerDiedError(RuntimeError):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Cell:
+class Cell(ABC):
     """One part of a study, which is run once, in whatever process."""
 
-    work: Callable[[], Record]
-    """What it does; its record has the `rows` that are returned, and other keys."""
     module: str
     """Name of the module of what is run."""
     names: Mapping[str, Any]
@@ -88,6 +85,10 @@ class Cell:
     """Process in which it did."""
     keep: bool = False
     """Whether the files of its run are kept beside its record."""
+
+    @abstractmethod
+    def work(self) -> Record:
+        """Do what it does; the record has the `rows` that are returned, and other keys."""
 
     @cached_property
     def id(self) -> str:
@@ -123,22 +124,49 @@ def run_cells(
 ) -> dict[str, Record]:
     """Run the cells that a folder has no record of, by the `workers`, and return all records by id.
 
-    Cells that mean the same are run once. Each record is kept as soon as it is there.
+    Cells that mean the same are run once. Each record is kept as soon as it is there. When a worker dies,
+    nobody knows which cell it had, so each that was under way is tried again alone.
     """
     every = {cell.id: cell for cell in cells}
     records = {name: known for name, cell in every.items() if (known := read_record(folder, cell))}
     if retry_failed:
         records = {name: record for name, record in records.items() if not record["failure"]}
-    remaining = [cell for name, cell in every.items() if name not in records]
-    command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
-    told = on_cell or (lambda *_: None)
-    told(0, len(remaining))
-    for done, (cell, found) in enumerate(outcomes(Cell.record, remaining), start=1):
-        record = cell.failed(found) if isinstance(found, WorkerDiedError) else found
+    remaining = {name: cell for name, cell in every.items() if name not in records}
+    command, total = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]), len(remaining)
+    deaths: tuple[type[Exception], ...] = (BrokenProcessPool,)
+    with suppress(ImportError):
+        from distributed import KilledWorker  # noqa: PLC0415 - an extra
+
+        deaths = (BrokenProcessPool, KilledWorker)
+
+    def keep(record: Record) -> None:
+        name = record["id"]
         record["made"]["command"] = command
-        write_record(folder, cell, record)
-        records[cell.id] = record
-        told(done, len(remaining))
+        write_record(folder, remaining.pop(name), record)
+        records[name] = record
+        told(total - len(remaining), total)
+
+    def tasks(sent: list[str]) -> Iterator[Any]:
+        for name, cell in [*remaining.items()]:
+            sent.append(name)
+            yield delayed(Cell.record)(cell)
+
+    told = on_cell or (lambda *_: None)
+    told(0, total)
+    while remaining:
+        sent = list[str]()
+        try:
+            for record in Parallel(return_as="generator_unordered", batch_size=1)(tasks(sent)):
+                keep(record)
+        except deaths:
+            for name in [name for name in sent if name in remaining]:
+                try:  # one job would be done by this very process
+                    (record,) = Parallel(n_jobs=2)([delayed(Cell.record)(remaining[name])])
+                except deaths as error:
+                    died = WorkerDiedError(f"the process that ran it died: {error}")
+                    died.__cause__ = error
+                    record = remaining[name].failed(died)
+                keep(record)
     return {name: records[name] for name in every}
 
 
@@ -251,46 +279,6 @@ def workers(jobs: int = 1, cluster: str | None = None) -> Iterator[None]:
         yield
 
 
-def outcomes(work: Callable[[W], R], items: Sequence[W]) -> Iterator[tuple[W, R | WorkerDiedError]]:
-    """Yield (item, work(item)) in the order in which they finish; `work` must not raise.
-
-    When a worker dies, nobody knows which item it had, so each item under way is tried again alone.
-    """
-    remaining, sent = dict(enumerate(items)), list[int]()
-
-    def run(numbers: Iterable[int], **options: Any) -> Iterator[tuple[int, R]]:
-        def tasks() -> Iterator[Any]:
-            for number in numbers:
-                sent.append(number)
-                yield delayed(_numbered)(work, number, remaining[number])
-
-        yield from Parallel(return_as="generator_unordered", batch_size=1, **options)(tasks())
-
-    deaths: tuple[type[Exception], ...] = (BrokenProcessPool,)
-    with suppress(ImportError):
-        from distributed import KilledWorker  # noqa: PLC0415 - an extra
-
-        deaths = (BrokenProcessPool, KilledWorker)
-    while remaining:
-        sent.clear()
-        try:
-            for number, result in run(list(remaining)):
-                yield remaining.pop(number), result
-        except deaths:
-            for number in [number for number in sent if number in remaining]:
-                try:
-                    ((_, again),) = run([number], n_jobs=2)  # one job would be done by this very process
-                except deaths as error:
-                    died = WorkerDiedError(f"the process that ran it died ({type(error).__name__})")
-                    yield remaining.pop(number), died
-                else:
-                    yield remaining.pop(number), again
-
-
-def _numbered(work: Callable[[W], R], number: int, item: W) -> tuple[int, R]:
-    return number, work(item)
-
-
 # --- cells of estimators and of functions ------------------------------------------------------------------
 
 
@@ -306,32 +294,29 @@ class EstimatorCell(Cell):
     parameters: Any
     """Own ones of the estimator, a frozen dataclass; None where it has none."""
 
-
-def run_on_drive(
-    drive: Drive, estimator: str, settings: MapperSettings, parameters: Any, keep: bool
-) -> Record:
-    """Run an estimator on a log, and return its metrics and, with `keep`, its files."""
-    log, hints = drive.load()
-    begin, worked = time.perf_counter(), time.thread_time()
-    result = run_estimator(estimator, settings, log, parameters)
-    wall, processor = time.perf_counter() - begin - result.observing, time.thread_time() - worked
-    cycles = online_cycles(result)
-    took = wall, sum(record.processor for record in cycles) if cycles else processor
-    said = [record.notice for record in result.cycles if record.notice]
-    vehicle = result.at_scale_one().vehicle
-    said += [] if vehicle is None else diagnose(vehicle, result.settings)
-    record: Record = {
-        "notices": "; ".join(dict.fromkeys(said)),
-        "lap_count": result.laps,
-        "rows": measure(result, log, took),
-        "stages": stage_times(cycles),
-    }
-    if keep:  # as texts: a worker may have no disk in common with the study
-        with tempfile.TemporaryDirectory() as place:
-            write_result(Path(place) / "run", result, summarize(result, log, hints))
-            files = (Path(place) / "run").iterdir()
-            record[FILES] = {file.name: file.read_text(encoding="utf-8") for file in files}
-    return record
+    def work(self) -> Record:
+        """Run the estimator on the log, and return its metrics and, where they are kept, its files."""
+        log, hints = self.drive.load()
+        begin, worked = time.perf_counter(), time.thread_time()
+        result = run_estimator(self.estimator, self.settings, log, self.parameters)
+        wall, processor = time.perf_counter() - begin - result.observing, time.thread_time() - worked
+        cycles = online_cycles(result)
+        took = wall, sum(record.processor for record in cycles) if cycles else processor
+        said = [record.notice for record in result.cycles if record.notice]
+        vehicle = result.at_scale_one().vehicle
+        said += [] if vehicle is None else diagnose(vehicle, result.settings)
+        record: Record = {
+            "notices": "; ".join(dict.fromkeys(said)),
+            "lap_count": result.laps,
+            "rows": measure(result, log, took),
+            "stages": stage_times(cycles),
+        }
+        if self.keep:  # as texts: a worker may have no disk in common with the study
+            with tempfile.TemporaryDirectory() as place:
+                write_result(Path(place) / "run", result, summarize(result, log, hints))
+                files = (Path(place) / "run").iterdir()
+                record[FILES] = {file.name: file.read_text(encoding="utf-8") for file in files}
+        return record
 
 
 def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> RunResult:
@@ -345,6 +330,17 @@ def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any
     return with_own(result, parameters)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FunctionCell(Cell):
+    """A function of a module that returns rows, with its arguments."""
+
+    function: RowsOf
+    arguments: Mapping[str, Any]
+
+    def work(self) -> Record:
+        return {"rows": self.function(**self.arguments)}
+
+
 def rows_of(
     function: RowsOf,
     arguments: Iterable[Mapping[str, Any]],
@@ -352,21 +348,25 @@ def rows_of(
     *,
     jobs: int = 1,
     on_cell: OnCell | None = None,
-    others: Mapping[str, Any] | None = None,
     depends: Any = None,
 ) -> pd.DataFrame:
     """Return the rows of a function of a module for each of some arguments; SolveError where one fails.
 
-    With a `folder` they are kept there, so that a study that was killed goes on. `others` are arguments that
-    change no row; `depends` is what the rows depend on beside the arguments and the code of the module.
+    With a `folder` they are kept there, so that a study that was killed goes on. `depends` is what the rows
+    depend on beside the arguments and the code of the module.
     """
-    code, module, cells = code_from(function.__module__), function.__module__, list[Cell]()
+    code, cells = code_from(function.__module__), list[FunctionCell]()
     for of in arguments:
-        names = {name: value for name, value in of.items() if isinstance(value, str | int | float)}
-        meaning = str(joblib.hash([function.__qualname__, dict(of), depends]))
-        work = partial(_rows, function, {**of, **(others or {})})
-        about: dict[str, Any] = {"module": module, "code": code, "began": here()}
-        cells.append(Cell(work=work, names=names, meaning=meaning, **about))
+        cell = FunctionCell(
+            module=function.__module__,
+            names={name: value for name, value in of.items() if isinstance(value, str | int | float)},
+            meaning=str(joblib.hash([function.__qualname__, dict(of), depends])),
+            code=code,
+            began=here(),
+            function=function,
+            arguments=of,
+        )
+        cells.append(cell)
     with tempfile.TemporaryDirectory() if folder is None else nullcontext(folder) as place, workers(jobs):
         records = run_cells(cells, Path(place), on_cell=on_cell, retry_failed=True)
     for cell in cells:
@@ -376,15 +376,11 @@ def rows_of(
     return pd.DataFrame([{k: np.nan if v is None else v for k, v in row.items()} for row in rows])
 
 
-def _rows(function: RowsOf, arguments: Mapping[str, Any]) -> Record:
-    return {"rows": function(**arguments)}
-
-
 # --- studies ---------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(Brief):
     """A study with its tracks and all of its cells, in the order of the results."""
 
     study: Study
@@ -434,7 +430,6 @@ def make_plan(study: Study, *, keep: bool = False) -> Plan:
         read = {k: v for k, v in leaves(settings).items() if registry.reads(estimator, k)}
         own = None if parameters is None else to_plain(asdict(parameters))
         cell = EstimatorCell(
-            work=partial(run_on_drive, drive, estimator, settings, parameters, keep),
             module=registry.module_of(estimator),
             names={"track": drive.track, "seed": drive.seed, "noise": drive.noise}
             | {"estimator": estimator, "variant": name},
@@ -452,20 +447,18 @@ def make_plan(study: Study, *, keep: bool = False) -> Plan:
     return Plan(study, tracks, tuple(cells))
 
 
-def run_study(study: Study, out: Path | str | None = None, *, keep: bool = False, **how: Any) -> pd.DataFrame:
+def run_study(
+    study: Study | Plan, out: Path | str | None = None, *, keep: bool = False, **how: Any
+) -> pd.DataFrame:
     """Run the cells of a study that are missing, and return all of its results, a row per run and lap.
 
     Finished cells are kept in the folder `out`, if there is one, and with `keep` what each has made. `how` is
     that of `run_records`.
     """
+    plan = study if isinstance(study, Plan) else make_plan(study, keep=keep)
     with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
-        return run_plan(make_plan(study, keep=keep), Path(folder), **how)
-
-
-def run_plan(plan: Plan, out: Path, **how: Any) -> pd.DataFrame:
-    """Run what is missing of a study in a folder, and return its frame; `how` is that of `run_records`."""
-    records = run_records(plan, out, **how)
-    add_agreement(out, plan.cells, records)
+        records = run_records(plan, Path(folder), **how)
+        add_agreement(Path(folder), plan.cells, records)
     return frame_of(plan.study, [(cell, records[cell.id]) for cell in plan.cells])
 
 

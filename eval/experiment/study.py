@@ -3,16 +3,19 @@
 import hashlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
+from html import escape
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError, check_name
+from pathspace_graph.eval.figures.notebook import table
 from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.io.files import is_temporary
 from pathspace_graph.io.log import FILES, LOG_FILE, Log
@@ -163,7 +166,17 @@ class Baseline:
     """Estimator of the baseline; without one, each estimator is compared with itself."""
 
 
-@dataclass(frozen=True, kw_only=True)
+class Published(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Figures of a publication, beside which a study shows its own."""
+
+    source: str = ""
+    laps: dict[str, dict[str, list[float]]] = {}
+    """Values after each lap, in the units of the tables, by estimator and metric."""
+    notes: dict[str, str] = {}
+    """How far a metric can be compared, by metric."""
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Study:
     """Grid of tracks x seeds x noise x estimators x settings, checked when it is made."""
 
@@ -192,6 +205,7 @@ class Study:
     """Combination that the others are compared with."""
     metrics: tuple[str, ...] = ("rmse", "missed", "size", "ms_mean")
     """Metrics that the summary compares with the baseline."""
+    published: Published = field(default_factory=Published)
 
     def __post_init__(self) -> None:
         """Raise SettingsError if anything is unknown, empty, named twice or out of its range."""
@@ -216,6 +230,16 @@ class Study:
             expected = "baseline.estimator: expected one of the study's estimators"
             check_name(self.baseline.estimator, self.estimators, expected)
 
+    def __repr__(self) -> str:
+        tracks = [*self.tracks, *self.logs]
+        sizes = {"tracks": len(tracks), "seeds": len(self.seeds), "noises": len(self.noises)}
+        sizes |= {"estimators": len(self.estimators), "variants": len(self.points)}
+        return f"Study({self.name}: {' x '.join(f'{n} {name}' for name, n in sizes.items())})"
+
+    def _repr_html_(self) -> str:
+        values = ((entry.name, getattr(self, entry.name)) for entry in fields(self))
+        return f"<h4>{escape(repr(self))}</h4>{table(pair for pair in values if pair[1])}"
+
     def _check_lists(self) -> None:
         if not self.tracks and not self.logs:
             expected = "track files, or seeds of generated tracks"
@@ -235,6 +259,10 @@ class Study:
             check_name(name, registry.known_estimators(), "estimators: expected a known estimator")
         for name in self.metrics:
             check_name(name, METRICS, "metrics: expected a known metric")
+        for name, of_laps in self.published.laps.items():
+            check_name(name, self.estimators, "published.laps: expected one of the study's estimators")
+            for metric in of_laps:
+                check_name(metric, METRICS, f"published.laps.{name}: expected a known metric")
 
     def simulation(self, noise: str) -> SimulationSettings:
         overrides = dict(self.noise[noise])
@@ -344,7 +372,7 @@ def read_study_file(file: Path | str) -> Study:
 _KINDS: Final[Mapping[str, type]] = {  # types of the keys of a study's file
     **dict.fromkeys(("name", "question"), str),
     **dict.fromkeys(_LISTS, list),
-    **dict.fromkeys(("drives", "settings", "noise", "variants", "baseline"), Mapping),
+    **dict.fromkeys(("drives", "settings", "noise", "variants", "baseline", "published"), Mapping),
     **dict.fromkeys(("laps", "grid"), object),
 }
 
@@ -370,6 +398,10 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
     for key, value in baseline.items():
         check_name(key, ("variant", "estimator"), "baseline: expected a known key")
         _typed(f"baseline.{key}", value, str)
+    try:
+        values["published"] = msgspec.convert(values.get("published", {}), Published)
+    except msgspec.ValidationError as error:
+        raise SettingsError(f"published: {error}") from error
     return Study(**values | {"baseline": Baseline(**baseline)})
 
 

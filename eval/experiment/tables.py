@@ -1,41 +1,168 @@
-"""Tables of texts in every form, those of a study, and the files of its results."""
+"""Means and paired differences with their intervals and tests; tables, figure and files of results."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 from rich.table import Table as RichTable
 from rich.text import Text
+from scipy import stats
 from tabulate import LATEX_ESCAPE_RULES
 
-from pathspace_graph.eval.figures.style import save_figures
+from pathspace_graph.eval.figures import style
+from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH, save_figures
 from pathspace_graph.eval.metrics.measures import METRICS, UNKNOWN, Metric, figure
-from pathspace_graph.io.files import replacing, write_text
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.io.files import atomic_file, write_text
 
-from .plots import plot_differences
-from .statistics import (
-    COMBINATION,
-    LEVEL,
-    RUN,
-    RUN_OF,
-    TIMES,
-    Estimate,
-    by_track,
-    contrasts,
-    estimate,
-    last_laps,
-)
 from .study import Study
 
+COMBINATION: Final = ("noise", "estimator", "variant")  # columns of a combination, which is compared
+RUN: Final = ("track", "seed")  # columns of a drive; combinations are paired on the same drive and noise
+RUN_OF: Final = (*RUN, *COMBINATION)
+TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
+LEVEL: Final = 0.95  # confidence level of intervals; a difference is significant if p < 1 - LEVEL
+ROUND_OFF: Final = 1e-12  # share of differences below which they are all the same
+
 MADE: Final = ("commit", "host", "processor", "blas", "date", "command")  # where and when a run was made
+RATIO: Final = "ratio"  # note of a ratio of two estimators beside a published one
 MEAN_DIGITS: Final = 2  # least number of digits after the decimal point of a mean beside its difference
+MAX_PANELS: Final = 3  # most metrics side by side in the figure of differences
 FORMS: Final = {"txt": "simple", "md": "pipe"}  # form in tabulate by the suffix of a file
 _UNICODE: Final = str.maketrans(  # LaTeX for characters that not every font has
     {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$", "×": r"$\times$"}
 )
+
+
+class Estimate(NamedTuple):
+    """Mean and its 95 % interval over independent samples."""
+
+    mean: float  # NaN without samples
+    half: float  # half the width of the interval; NaN for fewer than two samples
+
+
+def by_track(values: pd.Series) -> pd.Series:
+    """Return the mean of each track, of values by track and seed; of a single track the values themselves.
+
+    Drives of one track meet the same bends and cones, so tracks are the independent samples. Of a single
+    track nothing can be said but about its drives.
+    """
+    tracks = values.groupby(level="track", sort=False).mean()
+    return tracks if len(tracks) > 1 else values
+
+
+def estimate(values: ArrayLike) -> Estimate:
+    """Return the mean m of independent values (n,) that are known, and Student's `m -+ t s / sqrt(n)`."""
+    known = np.asarray(values, float)
+    known = known[np.isfinite(known)]
+    n = len(known)
+    if n < 2:
+        return Estimate(float(known[0]) if n else float("nan"), float("nan"))
+    half = stats.t.ppf(0.5 + LEVEL / 2, n - 1) * stats.sem(known)
+    return Estimate(float(np.mean(known)), float(half))
+
+
+def paired_p(differences: Array) -> float:
+    """Return the two-sided p of the paired t-test that the mean of the differences (n,) is 0.
+
+    It is NaN for fewer than two pairs. Without any spread it is 1 where all differences are 0, else 0.
+    """
+    if len(differences) < 2:
+        return float("nan")
+    if np.ptp(differences) <= ROUND_OFF * np.abs(differences).max():
+        return float(differences[0] == 0.0)
+    return float(stats.ttest_1samp(differences, 0.0).pvalue)
+
+
+def wilcoxon_p(differences: Array) -> float:
+    """Return the two-sided p of Wilcoxon's signed-rank test, which asks for no normal distribution.
+
+    It is at least `2^(1 - n)` for n pairs, and NaN without a pair that differs.
+    """
+    different = differences[differences != 0.0]
+    return float(stats.wilcoxon(different).pvalue) if len(different) else float("nan")
+
+
+def holm(p: Array) -> Array:
+    """Return p (m,) corrected by Holm's method.
+
+    The i-th smallest becomes `max over j <= i of (m - j) p_(j)`, j from 0, at most 1. NaN isn't counted and
+    stays NaN. scipy.stats corrects the false discovery rate only, so this is written by hand.
+    """
+    corrected = np.full(len(p), np.nan)
+    known = np.flatnonzero(~np.isnan(p))
+    order = known[np.argsort(p[known], kind="stable")]
+    factors = len(order) - np.arange(len(order))
+    corrected[order] = np.minimum(np.maximum.accumulate(factors * p[order]), 1.0)
+    return corrected
+
+
+# --- contrasts -------------------------------------------------------------------------------------------
+
+
+def last_laps(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the last row of each run that finished."""
+    finished = frame[frame["failure"] == ""]
+    return finished.groupby(list(RUN_OF), sort=False).tail(1)
+
+
+def names_of(frame: pd.DataFrame, otherwise: str) -> list[str]:
+    """Return the columns in which the combinations differ, or another one where there is only one."""
+    return [name for name in COMBINATION if frame[name].nunique() > 1] or [otherwise]
+
+
+@dataclass(frozen=True)
+class Contrast:
+    """One metric of one combination, and its difference from the baseline, drive by drive."""
+
+    noise: str
+    estimator: str
+    variant: str
+    metric: str  # key of the metric
+    runs: int  # number of runs with a value at the end of their last lap
+    value: Estimate  # mean over the tracks
+    difference: Estimate | None  # mean over the tracks; None for the baseline itself
+    differences: tuple[float, ...] = ()  # of each track, or of each drive of a single track
+    p: float = float("nan")  # p of the paired t-test over them, corrected for all hypotheses of the metric
+    wilcoxon: float = float("nan")  # p of Wilcoxon's signed-rank test over them, not corrected
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance alone rarely makes such a difference anywhere in the study."""
+        return bool(self.p < 1.0 - LEVEL)
+
+
+def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
+    """Return every combination against the baseline of its noise, in the study's order.
+
+    Nothing is tested where all differences are 0, as between cells that mean the same, nor of a wall time,
+    which depends on what else the machine does. The cells of a drive are run one after another, so that
+    processor times are.
+    """
+    known = last_laps(frame).astype({metric: float}).dropna(subset=[metric])
+    runs = {key: of.set_index([*RUN])[metric] for key, of in known.groupby([*COMBINATION], sort=False)}
+    nothing = pd.Series(dtype=float, index=pd.MultiIndex.from_arrays([[], []], names=RUN))
+    contrasted = []
+    for key in product(study.noises, study.estimators, study.points):
+        base = (key[0], study.baseline.estimator or key[1], study.baseline_variant)
+        values, against = runs.get(key, nothing), runs.get(base, nothing)
+        contrast = Contrast(*key, metric, len(values), estimate(by_track(values)), None)
+        if key != base:
+            d = by_track((values - against).dropna()).to_numpy()
+            contrast = replace(contrast, difference=estimate(d), differences=tuple(d.tolist()))
+            if d.any() and METRICS[metric].time != "wall":
+                contrast = replace(contrast, p=paired_p(d), wilcoxon=wilcoxon_p(d))
+        contrasted.append(contrast)
+    corrected = holm(np.array([contrast.p for contrast in contrasted]))
+    return [replace(contrast, p=float(p)) for contrast, p in zip(contrasted, corrected, strict=True)]
+
+
+# --- tables of texts -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,35 +235,36 @@ class Table:
 # --- tables of results -----------------------------------------------------------------------------------
 
 
-def mean(key: str, runs: pd.DataFrame) -> str:
+def mean(metric: Metric, runs: pd.DataFrame) -> str:
     """Return the mean of a metric over the tracks of runs with its interval, or its root mean square."""
-    metric, values = METRICS[key], runs[key].astype(float) if key in runs else pd.Series(dtype=float)
+    values = runs[metric.key].astype(float) if metric.key in runs else pd.Series(dtype=float)
     if metric.average == "rms":
         return metric.text(metric.over(values))
     if len(values):
-        values = by_track(runs.assign(**{key: values}).set_index("track")[key].dropna())
-    return estimate(values).text(metric.digits, metric.factor)
+        values = by_track(runs.assign(value=values).set_index("track")["value"].dropna())
+    return metric.text(*estimate(values))
 
 
-def by_metric(parts: Mapping[str, pd.DataFrame], keys: Sequence[str]) -> Table:
+def by_metric(parts: Mapping[str, pd.DataFrame], metrics: Sequence[Metric]) -> Table:
     """Return a row for each metric, and a column for each part of the runs."""
-    rows = ((METRICS[key].heading, *(mean(key, runs) for runs in parts.values())) for key in keys)
+    rows = ((metric.heading, *(mean(metric, runs) for runs in parts.values())) for metric in metrics)
     return Table.of(("metric", *parts), rows)
 
 
-def by_name(frame: pd.DataFrame, names: Sequence[str], keys: Sequence[str]) -> Table:
-    """Return the last laps of the runs, with a row for each value of the columns `names`."""
-    groups = last_laps(frame).groupby([*names], sort=False)
-    rows = ((", ".join(map(str, of)), *(mean(key, runs) for key in keys)) for of, runs in groups)
-    return Table.of((", ".join(names), *(METRICS[key].heading for key in keys)), rows)
+def by_name(frame: pd.DataFrame, names: Sequence[str], metrics: Sequence[Metric]) -> Table:
+    """Return a row for the rows of a frame with each value of the columns `names`."""
+    groups = frame.groupby([*names], sort=False)
+    rows = ((", ".join(map(str, of)), *(mean(metric, runs) for metric in metrics)) for of, runs in groups)
+    return Table.of((", ".join(names), *(metric.heading for metric in metrics)), rows)
 
 
 # --- tables of studies -----------------------------------------------------------------------------------
 
 
-def names_of(frame: pd.DataFrame, otherwise: str) -> list[str]:
-    """Return the columns in which the combinations differ, or another one where there is only one."""
-    return [name for name in COMBINATION if frame[name].nunique() > 1] or [otherwise]
+def _shown(frame: pd.DataFrame, keys: Iterable[str]) -> list[Metric]:
+    """Return the metrics that a frame has; beside differences a mean has at least two digits."""
+    known = (METRICS[key] for key in keys if key in frame)
+    return [replace(metric, digits=max(metric.digits, MEAN_DIGITS)) for metric in known]
 
 
 def results_table(
@@ -147,12 +275,12 @@ def results_table(
     A cell is the mean and its interval over the tracks, at the end of the last lap. The best mean of a noise
     is bold, where a metric has a best.
     """
-    shown = [METRICS[key] for key in keys or study.metrics if key in frame]
+    shown = _shown(frame, keys or study.metrics)
     names, rows, best = names_of(frame, "estimator"), dict[str, list[str]](), dict[str, list[bool]]()
     for metric in shown:
         column = contrasts(study, frame, metric.key)
         rows |= {name: [getattr(one, name) for one in column] for name in names}
-        rows[metric.heading] = [_mean(metric, one.value) for one in column]
+        rows[metric.heading] = [metric.text(*one.value) for one in column]
         sign = (metric.best == "least") - (metric.best == "most")
         means = pd.Series([sign * one.value.mean for one in column])
         of_noise = means.groupby([one.noise for one in column])
@@ -168,14 +296,13 @@ def results_table(
 def summary_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
     """Return a table for each metric of the study that its runs have: each combination by the baseline."""
     names, tables = names_of(frame, "variant"), []
-    for metric in (METRICS[key] for key in study.metrics if key in frame):
+    for metric in _shown(frame, study.metrics):
         rows = []
         for one in contrasts(study, frame, metric.key):
-            by = "baseline" if one.difference is None else _mean(metric, one.difference, "+")
+            by = "baseline" if one.difference is None else metric.text(*one.difference, sign="+")
             tested = (_p(one.p), _p(one.wilcoxon), "*" if one.significant else "")
-            rows.append(
-                (*(getattr(one, n) for n in names), str(one.runs), _mean(metric, one.value), by, *tested)
-            )
+            value = str(one.runs), metric.text(*one.value)
+            rows.append((*(getattr(one, name) for name in names), *value, by, *tested))
         header = (*names, "runs", "mean", "difference", "p", "Wilcoxon", "")
         tables.append(Table.of(header, rows, metric.heading, len(names)))
     return tables
@@ -189,9 +316,9 @@ def contrast_table(study: Study, frame: pd.DataFrame) -> Table:
     for one in contrasts(study, frame, first.key):
         values = [getattr(one, name) for name in names]
         runs = last[(last[names] == values).all(axis=1)]
-        difference = estimate(one.differences).text(first.digits, first.factor)
-        rest = (mean(other.key, runs) for other in others)
-        rows.append((", ".join(values), mean(first.key, runs), difference, figure(one.p), *rest))
+        difference = first.text(*estimate(one.differences))
+        rest = (mean(other, runs) for other in others)
+        rows.append((", ".join(values), mean(first, runs), difference, figure(one.p), *rest))
     headings = (first.heading, "difference", "p", *(other.heading for other in others))
     return Table.of((", ".join(names), *headings), rows)
 
@@ -211,8 +338,47 @@ def track_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
     return tables
 
 
-def _mean(metric: Metric, of: Estimate, sign: str = "") -> str:
-    return of.text(max(metric.digits, MEAN_DIGITS), metric.factor, sign)
+def beside_published(study: Study, frame: pd.DataFrame) -> pd.DataFrame:
+    """Return each published value, ours after the same lap, its difference with the interval, and its note.
+
+    Last in a metric are the ratios of the first published estimator to each other one, which other tracks
+    and sensors change least. The values are in the units of the tables.
+    """
+    rows, known = [], frame[(frame["failure"] == "") & (frame["variant"] == study.baseline_variant)]
+    first, *others = study.published.laps
+    for metric in (METRICS[key] for key in study.published.laps[first] if key in frame):
+        note, means = study.published.notes.get(metric.key, ""), dict[tuple[str, int], tuple[float, float]]()
+        for name, of_laps in study.published.laps.items():
+            for lap, there in enumerate(of_laps.get(metric.key, ()), 1):
+                runs = known[(known["estimator"] == name) & (known["lap"] == lap)].set_index([*RUN])
+                here, half = (metric.factor * x for x in estimate(by_track(runs[metric.key].astype(float))))
+                if len(runs):
+                    means[name, lap] = there, here
+                    rows.append((metric.heading, name, lap, there, here, here - there, half, note))
+        for other, (name, lap) in product(others, means):
+            if name == first and min(means.get((other, lap), (0.0,))) > 0.0:
+                there, here = np.divide(means[first, lap], means[other, lap])
+                names = metric.title, f"{first} / {other}", lap
+                rows.append((*names, there, here, here - there, np.nan, RATIO))
+    header = ("metric", "estimator", "lap", "published", "here", "difference", "interval", "compared")
+    return pd.DataFrame(rows, columns=header)
+
+
+def plot_published(beside: pd.DataFrame) -> style.Picture:
+    """Draw what `beside_published` returns by lap, published values dashed; ratios are left out."""
+    panels = beside[beside["compared"] != RATIO].groupby("metric", sort=False)
+    with style.figure_context():
+        figure = style.Picture(figsize=(WIDTH, 2.4), layout="constrained")
+        all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
+        for axes, (heading, panel) in zip(all_axes, panels, strict=True):
+            for (name, of), color in zip(panel.groupby("estimator", sort=False), style.PALETTE, strict=False):
+                axes.errorbar(of["lap"], of["here"], of["interval"], fmt="o-", color=color, label=name)
+                axes.plot(of["lap"], of["published"], "s--", color=color, label=f"{name}, published")
+            laps = sorted({*panel["lap"]})
+            axes.set(title=heading, xlabel="lap", xticks=laps, xlim=(laps[0] - 0.5, laps[-1] + 0.5))
+            axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
+        style.shared_legend(figure)
+    return figure
 
 
 def _p(p: float) -> str:
@@ -251,6 +417,48 @@ def joined(tables: Sequence[Table], caption: str, form: str) -> str:
     return "\n".join([caption + "\n", *(table.text(form) for table in tables)])
 
 
+# --- figure of studies ----------------------------------------------------------------------------------
+
+
+def plot_differences(study: Study, frame: pd.DataFrame) -> style.Picture:
+    """Draw pairs, mean and interval of the difference of each combination from the baseline.
+
+    The panels are the first metrics in which any run differs; where none does, there are means in their
+    place.
+    """
+    every = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
+    panels = [p for p in every if any(d != 0.0 for contrast in p for d in contrast.differences)][:MAX_PANELS]
+    differ, panels = bool(panels), panels or every[:MAX_PANELS]
+    rows = [i for i in range(len(panels[0])) if not differ or any(panel[i].differences for panel in panels)]
+    with style.figure_context():
+        figure = style.Picture(figsize=(WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
+        all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, panel in zip(all_axes, panels, strict=True):
+            metric, rng = METRICS[panel[0].metric], np.random.default_rng(0)
+            if differ:
+                axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
+            for row, contrast in enumerate(panel[i] for i in rows):
+                shown = contrast.difference if differ else contrast.value
+                if shown is None or np.isnan(shown.mean):
+                    continue
+                color = BLUE if contrast.significant else GREY
+                pairs = metric.factor * np.array(contrast.differences)
+                scattered = row + rng.uniform(-0.22, 0.22, len(pairs))  # so that they can be seen apart
+                axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=3.5, zorder=2)
+                mean, half = metric.factor * shown.mean, metric.factor * shown.half
+                look: dict[str, Any] = {"color": color, "markersize": 4.5, "elinewidth": 1.0, "zorder": 3}
+                axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", **look)
+            axes.set_title(metric.heading)
+            axes.grid(axis="x")
+        differing = names_of(frame, "variant")
+        names = [", ".join(getattr(panels[0][i], name) for name in differing) for i in rows]
+        all_axes[0].set_yticks(range(len(rows)), names)
+        all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
+        text = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
+        figure.supxlabel(text if differ else "mean and 95 % interval")
+    return figure
+
+
 # --- files of studies ------------------------------------------------------------------------------------
 
 
@@ -258,10 +466,16 @@ def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     """Write results, times, figures and the summary in three forms, and return the text of the summary."""
     write_results(frame, out)
     tables, note = [*track_tables(study, frame), *summary_tables(study, frame)], caption(study, frame)
+    figures = {"differences": plot_differences(study, frame)}
+    if study.published.laps and len(beside := beside_published(study, frame)):
+        texts = beside.map(lambda x: figure(x) if isinstance(x, float) else str(x))
+        tables.append(Table(texts, f"Beside {study.published.source}", 3))
+        write_csv(out / "published.csv", beside)
+        figures["published"] = plot_published(beside)
     for form in ("txt", "md", "tex"):
         write_text(out / f"summary.{form}", joined(tables, note, form))
     results_table(study, frame).write(out, "table", "tex")
-    save_figures(out / "figures", {"differences": plot_differences(study, frame)})
+    save_figures(out / "figures", figures)
     return joined(tables, note, "txt")
 
 
@@ -279,5 +493,5 @@ def without_times(frame: pd.DataFrame) -> pd.DataFrame:
 
 def write_csv(file: Path, frame: pd.DataFrame) -> None:
     """Write a frame without its index, whole or not at all."""
-    with replacing(file) as temporary:
+    with atomic_file(file) as temporary:
         frame.to_csv(temporary, index=False, lineterminator="\n")

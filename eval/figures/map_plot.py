@@ -1,6 +1,6 @@
 """Pictures of a map, with its 2-sigma band and the truth if known, and of a log before it is mapped."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -56,7 +56,7 @@ def plot_map(
         raise SettingsError(f"band_scale: expected a positive number, found {band_scale}")
     with style.figure_context():
         figure = Picture(layout="constrained")
-        axes = figure.add_subplot()
+        axes = figure.add_subplot(title=title or "")
         # the legend names what is drawn first before the rest; zorder decides what lies on top
         for label, boundary in sorted(track.boundaries.items()):
             draw_boundary(axes, boundary, label, band_scale)
@@ -75,7 +75,7 @@ def plot_map(
             trajectory = smoothed
         if trajectory is not None and len(trajectory):
             draw_trajectory(axes, np.asarray(trajectory), health)
-        finish(figure, axes, title)
+        finish(figure, [axes])
     return figure
 
 
@@ -130,31 +130,49 @@ def draw_truth(axes: Axes, truth: Truth) -> None:
         style.draw_points(axes, truth.cones, "x", DARK, "true cones", **cross)
 
 
-def draw_start(axes: Axes) -> None:
-    """Mark the origin of the map frame, where the vehicle stood first, heading along x."""
-    size = 2.0 * style.MARKER_SIZE
-    style.draw_points(axes, np.zeros((1, 2)), ">", "black", "start", markersize=size, zorder=7)
-
-
-def finish(figure: Figure, axes: Axes, title: str | None) -> None:
-    """Mark the start, add frame, axis titles and legend, and give the figure the map's shape."""
-    draw_start(axes)
-    axes.margins(0.0)
-    axes.autoscale_view()
-    drawn = np.array([axes.get_xlim(), axes.get_ylim()])
-    low, high = drawn[:, 0] - MARGIN, drawn[:, 1] + MARGIN
-    style.set_frame(axes, low, high)
-    axes.set(xlabel="x [m]", ylabel="y [m]", title=title or "")
+def finish(figure: Figure, panels: Sequence[Axes], columns: int = 1) -> None:
+    """Mark the start, add frame, axis titles and legend, and give a figure the shape of its maps."""
+    for axes in panels:  # the origin of the map frame, where the vehicle stood first, heading along x
+        size = 2.0 * style.MARKER_SIZE
+        style.draw_points(axes, np.zeros((1, 2)), ">", "black", "start", markersize=size, zorder=7)
+        axes.margins(0.0)
+        axes.autoscale_view()
+    drawn = np.array([[axes.get_xlim(), axes.get_ylim()] for axes in panels])
+    low, high = drawn[:, :, 0].min(axis=0) - MARGIN, drawn[:, :, 1].max(axis=0) + MARGIN
+    for axes in panels:
+        axes.set(
+            aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x [m]", ylabel="y [m]"
+        )
+        axes.label_outer()
     style.shared_legend(figure)
-    width, height = high - low
-    figure.set_size_inches(WIDTH, min(7.5, WIDTH * height / width + 0.85))
+    (width, height), rows = high - low, -(-len(panels) // columns)
+    figure.set_size_inches(WIDTH, min(7.5, rows * WIDTH / columns * height / width + 0.85))
+
+
+def plot_maps(maps: Mapping[str, tuple[Map, Array]], truth: Truth | None) -> Picture:
+    """Draw maps and driven paths (n, 3) side by side over the truth, each below its title."""
+    columns = 1 if len(maps) == 1 else 2 if len(maps) <= 4 else 3
+    with style.figure_context():
+        figure = Picture(layout="compressed")
+        grid = figure.subplots(-(-len(maps) // columns), columns, sharex=True, sharey=True, squeeze=False)
+        for axes, (title, (track, path)) in zip(grid.flat, maps.items(), strict=False):
+            for label, boundary in sorted(track.boundaries.items()):
+                draw_boundary(axes, boundary, label)
+            if truth is not None:
+                draw_truth(axes, truth)
+            draw_trajectory(axes, path)
+            axes.set_title(title)
+        for axes in grid.flat[len(maps) :]:
+            axes.remove()
+        finish(figure, [*grid.flat][: len(maps)], columns)
+    return figure
 
 
 def plot_apart(first: Map, second: Map, apart: MapsApart, *, title: str | None = None) -> Picture:
     """Draw two maps, the first laid on the second, and how far they are apart there, in colours."""
     with style.figure_context():
         figure = Picture(layout="constrained")
-        axes = figure.add_subplot()
+        axes = figure.add_subplot(title=title or "")
         for track, color, name in ((first.moved(apart.motion), BLUE, "first"), (second, DARK, "second")):
             for boundary in track.boundaries.values():
                 points = mapped_points(boundary)
@@ -169,11 +187,11 @@ def plot_apart(first: Map, second: Map, apart: MapsApart, *, title: str | None =
         dots: dict[str, Any] = {"s": 9.0, "cmap": "YlOrRd", "vmin": 0.0, "linewidths": 0.0, "zorder": 2}
         drawn = axes.scatter(x, y, c=distances[order], **dots)
         figure.colorbar(drawn, ax=axes, label="distance from the other map [m]", shrink=0.8)
-        finish(figure, axes, title)
+        finish(figure, [axes])
     return figure
 
 
-def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
+def plot_log(log: Log, *, title: str | None = None) -> Picture:
     """Draw where the odometry alone leads, the detections seen from there, and the truth if it is known.
 
     Dead reckoning drifts: laps lie beside each other, and the detections of a cone apart.
@@ -181,8 +199,8 @@ def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
     odometry, stamps = log.odometry, np.array([cycle.t for cycle in log.cycles])
     poses = odometry.poses()
     with style.figure_context():
-        figure = style.Picture(layout="constrained")
-        axes = figure.add_subplot()
+        figure = Picture(layout="constrained")
+        axes = figure.add_subplot(title=title or "")
         # a cycle lies between two odometry stamps: its pose is interpolated, which a picture can bear
         at = np.column_stack([np.interp(stamps, odometry.t, column) for column in poses.T])
         seen = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in log.cycles)])
@@ -196,5 +214,5 @@ def plot_log(log: Log, *, title: str | None = None) -> style.Picture:
         axes.plot(*poses[:, :2].T, label="odometry alone", **line)
         if log.truth is not None:
             draw_truth(axes, log.truth)
-        finish(figure, axes, title)
+        finish(figure, [axes])
     return figure

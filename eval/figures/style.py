@@ -16,7 +16,7 @@ from matplotlib.path import Path as Outline
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.io.files import atomic_file, is_stream, replacing
+from pathspace_graph.io.files import atomic_file, is_stream
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.spline.bspline import BSpline
@@ -77,11 +77,6 @@ class Picture(Figure):
         return buffer.getvalue()
 
 
-def set_frame(axes: Axes, low: Array, high: Array) -> None:
-    """Show the rectangle between two corners (2,), m, with equal scales."""
-    axes.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-
-
 def shared_legend(figure: Figure) -> None:
     """Add one legend for all panels below them, of three rows: the left boundary, the right one, the rest."""
     entries: dict[str, Any] = {}
@@ -92,14 +87,6 @@ def shared_legend(figure: Figure) -> None:
     names = sorted(entries, key=lambda label: [not label.startswith(side) for side in sides])
     handles, columns = [entries[name] for name in names], max(ceil(len(names) / 3), 1)
     figure.legend(handles, names, loc="outside lower center", ncols=columns)
-
-
-def fit_height(figure: Figure) -> None:
-    """Make a figure as high as what is drawn on it, plus a margin of 0.05 in on both sides."""
-    for _ in range(2):  # the layout moves a little when the height changes
-        figure.draw_without_rendering()
-        width, _ = figure.get_size_inches()
-        figure.set_size_inches(width, figure.get_tightbbox().height + 0.1)
 
 
 # --- marks -----------------------------------------------------------------------------------------------
@@ -194,19 +181,12 @@ def check_plot_file(file: Path | str) -> str:
 def save_plot(figure: Figure, file: Path | str, dpi: float = DPI) -> None:
     """Write a .png (also to a stream), .pdf or .svg; raise SettingsError for any other suffix."""
     suffix = check_plot_file(file)
-    with atomic_file(Path(file)) as temporary:
-        render(figure, temporary, suffix, dpi)
+    with atomic_file(Path(file)) as temporary, mpl.rc_context(_FILE_RC):
+        figure.savefig(temporary, dpi=dpi, format=suffix[1:], metadata=_METADATA[suffix])
 
 
 def save_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
     """Write every figure under its name in `folder`, in the place of an earlier one."""
     for name, figure in figures.items():
         for suffix in SUFFIXES:
-            with replacing(folder / f"{name}{suffix}") as temporary:
-                render(figure, temporary, suffix)
-
-
-def render(figure: Figure, file: Path, suffix: str, dpi: float = DPI) -> None:
-    """Write a figure to `file`, whatever that is called, in the format of `suffix`."""
-    with mpl.rc_context(_FILE_RC):
-        figure.savefig(file, dpi=dpi, format=suffix[1:], metadata=_METADATA[suffix])
+            save_plot(figure, folder / f"{name}{suffix}")

@@ -16,7 +16,7 @@ from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import lap_end_indices
-from pathspace_graph.sim.curves import along_polyline, arc_lengths
+from pathspace_graph.sim.track import along_polyline, arc_lengths
 from pathspace_graph.spline.boundary import crossing_segments
 from pathspace_graph.spline.bspline import BSpline
 
@@ -169,27 +169,36 @@ def _along(spline: BSpline, step: float) -> Array:
     return spline.evaluate(spline.parameters_at((np.arange(count) + 0.5) * length / count))
 
 
-def curve_distance(track: Map, truth: Truth) -> dict[str, float]:
-    """Return mean_p min_q |p - q| over mapped points p, and mean_q min_p |q - p| over true ones q.
+def boundary_errors(track: Map, truth: Truth) -> dict[str, float]:
+    """Return how far the mapped boundaries and the true curves are apart, and what of the map is false.
 
-    All are in m, over both boundaries together: `mapped_to_truth` is large where something false is mapped,
-    `truth_to_mapped` where something true isn't. Points of curves are equal lengths apart. Landmarks have
-    nothing in between, so the second distance charges them for the gaps. Infinite where a boundary isn't
-    mapped, NaN where there is nothing to measure from.
+    `mapped_to_truth` is mean_p min_q |p - q| over mapped points p, large where something false is mapped;
+    `truth_to_mapped` is mean_q min_p |q - p| over true points q, large where something true isn't (m). Both
+    are over both boundaries together, at points equal lengths apart. Landmarks have nothing in between, so
+    the second one charges them for the gaps. It is infinite where a boundary isn't mapped; both are NaN where
+    there is nothing to measure from. `ghost_landmarks` and `ghost_metres` of curve have min_q |p - q| > 2 m,
+    as has a boundary without any true cone as a whole.
     """
-    forth, back = [np.zeros(0)], [np.zeros(0)]
+    forth, back, landmarks, metres = [np.zeros(0)], [np.zeros(0)], 0, 0.0
     for label in BOUNDARIES:
-        curve_true = true_curve(truth, label)
-        if len(curve_true) == 0:
-            continue
-        boundary = track.boundaries.get(label)
+        curve, boundary = true_curve(truth, label), track.boundaries.get(label)
         if boundary is None:
-            back.append(np.full(1, np.inf))
-        else:
-            forth.append(np.asarray(KDTree(curve_true).query(mapped_points(boundary))[0]))
+            back += [np.full(1, np.inf)] if len(curve) else []
+            continue
+        points = mapped_points(boundary)
+        away = np.asarray(KDTree(curve).query(points)[0]) if len(curve) else np.full(len(points), np.inf)
+        if len(curve):
+            forth.append(away)
             back.append(boundary_distances(boundary, true_curve(truth, label, MAPPED_STEP)))
-    to_truth, to_mapped = mean_of(np.concatenate(forth)), mean_of(np.concatenate(back))
-    return {"mapped_to_truth": to_truth, "truth_to_mapped": to_mapped}
+        if isinstance(boundary, SplineBoundary):
+            metres += float(np.mean(away > GHOST_DISTANCE)) * boundary.spline.length()
+        else:
+            landmarks += int(np.sum(away > GHOST_DISTANCE))
+    distances = {
+        "mapped_to_truth": mean_of(np.concatenate(forth)),
+        "truth_to_mapped": mean_of(np.concatenate(back)),
+    }
+    return {**distances, "ghost_landmarks": landmarks, "ghost_metres": metres}
 
 
 def crossings(track: Map) -> tuple[int, int]:
@@ -243,21 +252,3 @@ def _crossings(points: Array, normals: Array, expected: Array, curve: Array) -> 
             if abs(nearest - expected[i]) < MISSED_DISTANCE:
                 offsets[i] = nearest
     return offsets
-
-
-def ghosts(track: Map, truth: Truth) -> dict[str, float]:
-    """Return the landmarks p and the metres of curve with min_q |p - q| > 2 m, q on the true curve.
-
-    The true curve is that of the same boundary. A boundary without any true cone is a ghost as a whole.
-    """
-    landmarks, metres = 0, 0.0
-    for label, boundary in track.boundaries.items():
-        points, curve = mapped_points(boundary), true_curve(truth, label)
-        is_ghost = np.ones(len(points), dtype=bool)
-        if len(curve) and len(points):
-            is_ghost = np.asarray(KDTree(curve).query(points)[0] > GHOST_DISTANCE)
-        if isinstance(boundary, SplineBoundary):
-            metres += float(np.mean(is_ghost)) * boundary.spline.length()
-        else:
-            landmarks += int(is_ghost.sum())
-    return {"ghost_landmarks": landmarks, "ghost_metres": metres}

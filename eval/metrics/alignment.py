@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -21,7 +21,7 @@ from pathspace_graph.factors.se2 import (
     rotated,
     wrap_angle,
 )
-from pathspace_graph.front_end.sightings import ConeTracker, SeenCycle
+from pathspace_graph.front_end.sightings import SeenCycle, Sightings
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
@@ -67,10 +67,6 @@ class MapsApart:
             }
             for name, own in {"both": both, **each}.items()
         }
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the motion and the statistics in plain types."""
-        return {"motion": self.motion, "distances": self.statistics()}
 
 
 def maps_apart(track: Map, reference: Map) -> MapsApart:
@@ -201,29 +197,27 @@ DRIFTED: Final = (2.0, 2.0, 0.1)  # standard deviations of dead reckoning at the
 STAYS: Final = 0.5  # most median distance of a cycle's cones from those of one of the last (m)
 TOGETHER: Final = 9  # cycles that are looked at together
 MOST_STANDING: Final = 100  # most cycles in which it stands
-NOT_STANDING: Final = "the vehicle stands at the {} for fewer than " + str(LEAST) + " cycles"
-TOO_FEW: Final = f"fewer than {LEAST} cones are seen standing at the start and at the end"
 
 
-def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise) -> Array | str:
+def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise | None) -> Array | None:
     """Return the last pose (3,) of a drive, by the cones seen standing at its end and at its start.
 
     The closest points of the same colour are paired, from starts around dead reckoning, and the near ones
     weigh most. No motion, latency or odometry is in the result: odometry misses the first decimetres of a
-    start, and goes on after a stop. The constant errors of the sensor are taken out. A text says why there is
-    no result.
+    start, and goes on after a stop. The constant errors of the sensor are taken out. None where the vehicle
+    does not stand, too few cones are seen meanwhile, or the noise was not measured.
     """
-    sides = {"start": standing(cycles[::-1]), "end": standing(cycles)}
-    for side, own in sides.items():
-        if not own:
-            return NOT_STANDING.format(side)
-    start, end = ([_cones(own, label, noise) for label in BOUNDARIES] for own in sides.values())
-    tries = [
-        _registered(start, end, compose(cycles[-1].pose, np.array(offset)))
-        for offset in product((-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-0.1, 0.0, 0.1))
-    ]
-    score, pose = max(tries, key=lambda one: one[0] - _drifted(one[1], cycles[-1].pose))
-    return np.append(pose[:2], wrap_angle(pose[2:])) if score > 0.0 else TOO_FEW
+    sides = standing(cycles[::-1]), standing(cycles)
+    if noise is None or not all(sides):
+        return None
+    start, end = ([_cones(own, label, noise) for label in BOUNDARIES] for own in sides)
+    tries, reckoned = list[tuple[float, float, Array]](), cycles[-1].pose
+    for offset in product((-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-0.1, 0.0, 0.1)):
+        score, pose = _registered(start, end, compose(reckoned, np.array(offset)))
+        drift = float(np.square(difference(pose, reckoned) / DRIFTED).sum())
+        tries.append((score - drift, score, pose))
+    _, score, pose = max(tries, key=lambda one: one[0])
+    return np.append(pose[:2], wrap_angle(pose[2:])) if score > 0.0 else None
 
 
 def standing(cycles: Sequence[SeenCycle]) -> list[SeenCycle]:
@@ -240,19 +234,11 @@ def standing(cycles: Sequence[SeenCycle]) -> list[SeenCycle]:
     return list(cycles[-count:]) if count >= LEAST else []
 
 
-def _drifted(pose: Array, reckoned: Array) -> float:
-    """Squared distance of a pose (3,) from dead reckoning, in its standard deviations."""
-    return float(np.square(difference(pose, reckoned) / DRIFTED).sum())
-
-
 def _cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise) -> tuple[Array, Array]:
     """Return the cones (k, 2) of a vehicle that stands, vehicle frame, and their covariances (k, 2, 2)."""
-    own = []
-    for cycle in cycles:
-        seen = cycle.detections
-        chosen = (seen.labels == label) & (np.hypot(*seen.points_vehicle.T) < FAR)
-        own.append(replace(cycle, detections=seen.where(chosen), pose=np.zeros(3), twist=np.zeros(3)))
-    table = ConeTracker(noise).follow(sorted(own, key=lambda one: one.detections.t))
+    table = Sightings.of(sorted(cycles, key=lambda one: one.detections.t))
+    table = table.where((table.cone == label) & (np.hypot(*table.point.T) < FAR))
+    table = replace(table, pose=0.0 * table.pose, twist=0.0 * table.twist).tracked(noise)
     numbers, counts = np.unique(table.cone, return_counts=True)
     points, seen_again = noise.corrected(table.point, np.zeros(3)), counts > SEEN_SHARE * len(cycles)
     means = [points[table.cone == cone].mean(axis=0) for cone in numbers[seen_again]]

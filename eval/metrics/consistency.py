@@ -1,6 +1,7 @@
 """Whether a covariance is honest: NEES of the map, errors at the true cones, turn and scale."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy  # which imports its modules when they are used
@@ -17,40 +18,17 @@ from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBounda
 from .accuracy import MISSED_DISTANCE, closest_points, cones_of, mean_of, true_curve
 
 
-@dataclass(frozen=True, slots=True)
-class NormalizedError:
-    """Normalized error squared `e' P^-1 e`, where P is the covariance that an estimator claims.
+def map_nees(track: Map, truth: Truth) -> float:
+    """Return the normalized estimation error squared (NEES) `e' P^-1 e` of a map by its degrees of freedom.
 
-    It is chi-squared distributed with `dof` degrees of freedom where P is honest (Bar-Shalom, Li and
-    Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4).
-    """
-
-    value: float  # `e' P^-1 e`; NaN where P is singular
-    dof: int  # degrees of freedom of the chi-squared distribution
-
-    @property
-    def ratio(self) -> float:
-        """Return the value per degree of freedom: 1 is honest, more overconfident, less too cautious."""
-        return self.value / self.dof if self.dof else float("nan")
-
-
-def _squared(error: Array, covariance: Array) -> float:
-    """Return e' P^-1 e, or NaN where P isn't positive definite."""
-    if len(error) == 0:
-        return 0.0
-    try:
-        return float(error @ cho_solve(cho_factor(covariance), error))
-    except np.linalg.LinAlgError:
-        return float("nan")
-
-
-def map_nees(track: Map, truth: Truth) -> NormalizedError:
-    """Return the normalized estimation error squared (NEES) of a map, by the covariance that it holds.
+    P is the covariance that the map holds: 1 is honest, more overconfident, less too cautious (Bar-Shalom, Li
+    and Kirubarajan, Estimation with Applications to Tracking and Navigation, section 5.4). NaN where P is
+    singular, or nothing is to be compared.
 
     A curve's error is its signed distance to the true curve, at as many places as it has degrees of freedom
     across itself; that of landmarks is their offset in the plane. The map that a user gets is judged, so
     every estimator is judged alike. A map holds no covariance between its boundaries, so errors that they
-    share (above all its heading) count twice: the mean of `ratio` over many runs is right, but it spreads
+    share (above all its heading) count twice: the mean over many runs is right, but it spreads
     more widely than a chi-squared one.
 
     The covariance is that of small errors. A turn of the whole map by a degree moves its far side by a metre
@@ -67,9 +45,12 @@ def map_nees(track: Map, truth: Truth) -> NormalizedError:
             error, covariance = curve_errors(boundary, true_curve(truth_laid, label), laid)
         else:
             error, covariance = landmark_errors(boundary, cones_of(truth_laid, label), laid)
-        value += _squared(error, covariance)
+        try:
+            value += float(error @ cho_solve(cho_factor(covariance), error)) if len(error) else 0.0
+        except np.linalg.LinAlgError:
+            return float("nan")
         dof += len(error)
-    return NormalizedError(value, dof)
+    return value / dof if dof else float("nan")
 
 
 def curve_errors(boundary: SplineBoundary, curve_laid: Array, laid: Array) -> tuple[Array, Array]:
@@ -89,7 +70,8 @@ def curve_errors(boundary: SplineBoundary, curve_laid: Array, laid: Array) -> tu
     u = low + np.mod(u - low, high - low) if spline.periodic else np.unique(np.clip(u, low, high))
     normal, position = spline.normal_unit(u), spline.evaluate(u)
     nearest = curve_laid[KDTree(curve_laid).query(position)[1]]
-    error = np.einsum("kd,kd->k", normal, nearest - position - _moved(position, laid))
+    moved = laid[0] * left_of(position) + laid[1] * position
+    error = np.einsum("kd,kd->k", normal, nearest - position - moved)
     design = np.einsum("km,kd->kmd", spline.basis_matrix(u), normal).reshape(len(u), -1)
     return error, design @ boundary.covariance @ design.T
 
@@ -107,13 +89,9 @@ def landmark_errors(boundary: PointBoundary, cones_laid: Array, laid: Array) -> 
     landmark, cone = landmark[paired], cone[paired]
     columns = (2 * landmark[:, None] + np.arange(2)).ravel()
     points = boundary.points[landmark]
-    error = (cones_laid[cone] - points - _moved(points, laid)).ravel()
+    moved = laid[0] * left_of(points) + laid[1] * points
+    error = (cones_laid[cone] - points - moved).ravel()
     return error, boundary.covariance[np.ix_(columns, columns)]
-
-
-def _moved(points: Array, laid: Array) -> Array:
-    """First-order motion (k, 2) of points (k, 2) by a turn (rad) and the logarithm of a scale (2,)."""
-    return np.asarray(laid[0] * left_of(points) + laid[1] * points)
 
 
 def consistency_at_cones(track: Map, truth: Truth) -> dict[str, float]:
@@ -150,8 +128,7 @@ def with_marginals(track: Map) -> Map:
     return Map(track.closed, {k: replace(b, covariance=b.covariance * blocks[k]) for k, b in splines.items()})
 
 
-@dataclass(frozen=True)
-class Deviation:
+class Deviation(NamedTuple):
     """Number by which a map as a whole deviates from the truth, whose frame is fixed at the start."""
 
     value: float  # NaN where nothing can be compared

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from pathspace_graph.factors.se2 import path_lengths
+from pathspace_graph.factors.se2 import difference, path_lengths
 from pathspace_graph.front_end.front_end import seen_cycles
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.log import Log, Truth
@@ -59,9 +59,9 @@ class Metric:
             return float("nan")
         return root_mean_square(known) if self.average == "rms" else float(np.mean(known))
 
-    def text(self, value: float, half: float = nan) -> str:
+    def text(self, value: float, half: float = nan, sign: str = "") -> str:
         """Return a value in the unit of the tables, with half the width of its interval."""
-        return figure(self.factor * value, self.factor * half, self.digits)
+        return figure(self.factor * value, self.factor * half, self.digits, sign)
 
 
 def figure(value: float, half: float = nan, digits: int = 3, sign: str = "") -> str:
@@ -120,7 +120,11 @@ _ALL: Final = (
     Metric("jump", "jump of the pose where the map is replaced", "m", 2, "run"),
     Metric("error_max", "largest trajectory error", "m", 2, "run", best="least"),
     Metric("end_off", "last pose from its registration on the beginning", "m", 2, "run", best="least"),
+    Metric("end_turn", "last heading from its registration on the beginning", "°", 1, "run"),
+    Metric("reckoned_off", "dead reckoning's last pose from that registration", "m", 2, "run"),
+    Metric("reckoned_turn", "dead reckoning's last heading from that registration", "°", 1, "run"),
     Metric("crossings", "crossings of the boundaries", "", 0, "run", best="least"),
+    Metric("crossings_own", "crossings of a boundary with itself", "", 0, "run", best="least"),
     Metric("agreement", "distance from the maps of the other drives", "m", 3, "run", best="least"),
     Metric("lost_at_end", "vehicle lost at the end", "%", 0, "run", best="least"),
     Metric("divergence_time", "longest time with an error of over 1 m, after closing", "s", 1, "run"),
@@ -154,9 +158,6 @@ _ALL: Final = (
 METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}  # in the order of tables
 
 
-# --- one metric ------------------------------------------------------------------------------------------
-
-
 # --- the measures of a run -------------------------------------------------------------------------------
 
 WHOLE: Final = "whole"  # name of the whole cycle among its stages
@@ -177,16 +178,16 @@ def stage_times(cycles: Sequence[CycleRecord]) -> list[dict[str, Any]]:
     return [*found.assign(share=means / total if total > 0.0 else np.nan).to_dict("records")]
 
 
-def map_bytes(track: Map) -> int:
-    """Return 8 (2 m + knots) bytes for each spline, with one period of its knots, 8 (2 m) for landmarks."""
-    splines = [b.spline for b in track.boundaries.values() if isinstance(b, SplineBoundary)]
+def map_bytes(track: Map) -> dict[str, int]:
+    """Return 8 (2 m + knots) bytes for each spline, with one period of its knots, 8 (2 m) for landmarks.
+
+    The symmetric joint covariance of each boundary has 8 n (n + 1) / 2 bytes, n = 2 m.
+    """
+    boundaries = track.boundaries.values()
+    splines = [b.spline for b in boundaries if isinstance(b, SplineBoundary)]
     knots = sum(len(spline.breaks if spline.periodic else spline.knots) for spline in splines)
-    return 8 * (2 * sum(boundary.size for boundary in track.boundaries.values()) + knots)
-
-
-def covariance_bytes(track: Map) -> int:
-    """Return 8 n (n + 1) / 2 bytes for each boundary's symmetric joint covariance, n = 2 m."""
-    return 8 * sum(boundary.size * (2 * boundary.size + 1) for boundary in track.boundaries.values())
+    covariance = sum(boundary.size * (2 * boundary.size + 1) for boundary in boundaries)
+    return {"bytes": 8 * (2 * sum(b.size for b in boundaries) + knots), "bytes_covariance": 8 * covariance}
 
 
 Row = dict[str, Any]
@@ -204,8 +205,9 @@ def measure(
     """Return a row for each complete lap, and one for the whole run as the last; lengths are over the scale.
 
     A lap's row has the map as it stood at its end, and the poses and updates of its cycles. Laps are the true
-    ones where the log has a true path, else the estimator's own. A batch has one map for all laps, and so one
-    row, that of the last lap. `took` is the wall time and the processor time of the whole run (s).
+    ones where the log has a true path and the run a snapshot of each, else the estimator's own. A batch has
+    one map for all laps, and so one row, that of the last lap. `took` is the wall time and the processor time
+    of the whole run (s).
     """
     run, log = run.at_scale_one(), log.at_scale_one()
     rows = list[Row]()
@@ -238,22 +240,22 @@ def _laps(run: RunResult, log: Log) -> Iterator[tuple[int, Map, float, float]]:
             yield run.laps, run.map, -np.inf, np.inf
         return
     maps = tuple(enumerate(run.snapshots, start=1))
-    if not true_laps:
-        maps = run.lap_maps
+    if not (true_laps and maps):
+        maps, ends = run.lap_maps, ends[:1]
         ends += [max(record.t for record in run.cycles if record.lap <= lap) for lap, _ in maps]
     for index, (lap, track) in enumerate(maps):
         yield lap, track, ends[index], ends[index + 1]
 
 
 def _map_values(track: Map, truth: Truth | None) -> dict[str, float]:
-    """Return the metrics of a map as it stands; without true cones only those that need none."""
-    values: dict[str, float] = {"size": track.size, "closed": bool(track.closed)}
-    values |= {"bytes": map_bytes(track), "bytes_covariance": covariance_bytes(track)}
+    """Return the metrics of a map as it stands; without true cones or covariances those that need none."""
+    values: dict[str, float] = {"size": track.size, "closed": bool(track.closed), **map_bytes(track)}
     if not has_cones(truth):
         return values
-    values |= accuracy.cone_errors(track, truth) | accuracy.curve_distance(track, truth)
-    values |= accuracy.ghosts(track, truth)
-    values |= {"nees": map_nees(track, truth).ratio} | consistency_at_cones(track, truth)
+    values |= accuracy.cone_errors(track, truth) | accuracy.boundary_errors(track, truth)
+    if any(own.size and not own.covariance.size for own in track.boundaries.values()):
+        return values  # an outline
+    values |= {"nees": map_nees(track, truth)} | consistency_at_cones(track, truth)
     for name, (error, sigma) in accuracy.centre_line_errors(track, truth).items():
         known = ~np.isnan(error)
         if known.any():
@@ -279,11 +281,14 @@ def _end_values(run: RunResult, log: Log) -> dict[str, float]:
     values: dict[str, float] = {}
     truth, t, poses = log.truth, run.trajectory_t, run.trajectory
     if not has_cones(truth):
-        values["crossings"] = sum(accuracy.crossings(run.map))
-        if log.measured is not None and len(poses):
-            end = end_by_registration(seen_cycles(log)[0], log.measured)
-            if not isinstance(end, str):
-                values["end_off"] = float(np.hypot(*(poses[-1, :2] - end[:2])))
+        others, values["crossings_own"] = accuracy.crossings(run.map)
+        values["crossings"] = others + values["crossings_own"]
+        seen, _ = seen_cycles(log)
+        end = end_by_registration(seen, log.measured) if len(poses) else None
+        if end is not None:
+            for name, pose in (("end", poses[-1]), ("reckoned", seen[-1].pose)):
+                off = difference(pose, end)
+                values |= {f"{name}_off": float(np.hypot(*off[:2])), f"{name}_turn": float(off[2])}
     if truth is None or len(poses) == 0:
         return values
     if run.vehicle is not None:

@@ -27,19 +27,22 @@ from .trajectory import position_rms, trajectory_errors
 GATE: Final = ("dropped", "refused")  # counts of the gate in each cycle
 
 
-def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
-    """Return the estimator, settings, versions, laps, timing, hints, and with truth the paper's metrics."""
+def summarize(result: RunResult, log: Log | None, hints: Sequence[Hint] = ()) -> dict[str, Any]:
+    """Return the estimator, settings, versions, laps, timing, hints, and with truth the paper's metrics.
+
+    Without the log, what only it can say is left out.
+    """
     factor = 1.0 / result.scale
     summary: dict[str, Any] = {
         "estimator": result.estimator,
         "settings": result.settings,
         "scale": result.scale,
-        "sensor_kind": result.settings.get("kind") or log.sensor.kind or "cones",
+        "sensor_kind": result.settings.get("kind") or (log and log.sensor.kind) or "cones",
         "versions": versions(),
         "lap_count": result.laps,
         "closed": result.map.closed,
         "size": result.map.size,
-        "not_mapped": not_mapped(result.map, log),
+        "not_mapped": not_mapped(result.map, log) if log is not None else [],
         "points": {NAMES[label]: own.size for label, own in sorted(result.map.points.items())},
         "gate": {name: sum(getattr(record, name) for record in result.cycles) for name in GATE},
         **_cycles(result),
@@ -60,7 +63,7 @@ def summarize(result: RunResult, log: Log, hints: Sequence[Hint] = ()) -> dict[s
         values |= {f"{name}_sigma": sigma for name, (_, sigma) in named.items()}
         summary |= {"calibration": values, "heading_sigma": float(result.vehicle.sigmas[2])}
         summary |= {"diagnosis": found} if found else {}
-    if log.truth is not None:
+    if log is not None and log.truth is not None:
         summary |= _errors(result, log, log.truth)
     return summary
 
@@ -101,13 +104,14 @@ def _errors(result: RunResult, log: Log, truth: Truth) -> dict[str, Any]:
     return found
 
 
-def _noise(noise: RunNoise, log: Log) -> dict[str, Any]:
+def _noise(noise: RunNoise, log: Log | None) -> dict[str, Any]:
     stated: dict[str, Any] = {}
-    if log.odometry_stated:
+    if log is not None and log.odometry_stated:
         stated["odometry"] = log.odometry_sigma.tolist()
-    points = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in log.cycles)])
-    if log.detections_stated and len(points):
-        covariances = np.concatenate([cycle.covariances for cycle in log.cycles])
+    cycles = log.cycles if log is not None and log.detections_stated else ()
+    points = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in cycles)])
+    if len(points):
+        covariances = np.concatenate([cycle.covariances for cycle in cycles])
         along, across = np.median(ray_sigmas(points, covariances), axis=0).tolist()
         distance = float(np.median(np.hypot(*points.T)))
         stated["detections"] = {"range": distance, "along": along, "across": across}

@@ -13,7 +13,7 @@ from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.run import ObservedCycle
-from pathspace_graph.sim.curves import arc_lengths
+from pathspace_graph.sim.track import arc_lengths
 
 from .accuracy import boundary_distances, root_mean_square, true_lap_ends
 
@@ -31,21 +31,16 @@ def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
     return np.stack([x, y, wrap_angle(theta)], axis=1)
 
 
-def pose_errors(t: Array, poses: Array, reference_t: Array, reference: Array) -> Array:
-    """Return [along, across, heading] (k, 3) in m, m, rad: the error of each pose in its reference's frame.
+def trajectory_errors(t: Array, poses: Array, truth: Truth) -> Array:
+    """Return [along, across, heading] (k, 3) in m, m, rad: the error of each pose in the true pose's frame.
 
-    t is (n,), poses is (n, 3). Nothing is aligned. Stamps outside those of the reference are left out.
+    t is (n,), poses is (n, 3). Nothing is aligned. Stamps outside those of the true path are left out.
     """
-    inside = (t >= reference_t[0]) & (t <= reference_t[-1])
-    expected = interpolate_poses(reference_t, reference, t[inside])
+    inside = (t >= truth.pose_t[0]) & (t <= truth.pose_t[-1])
+    expected = interpolate_poses(truth.pose_t, truth.poses, t[inside])
     dx, dy, turn = (poses[inside] - expected).T
     c, s = np.cos(expected[:, 2]), np.sin(expected[:, 2])
     return np.stack([c * dx + s * dy, c * dy - s * dx, wrap_angle(turn)], axis=1)
-
-
-def trajectory_errors(t: Array, poses: Array, truth: Truth) -> Array:
-    """Return `pose_errors` by the true path."""
-    return pose_errors(t, poses, truth.pose_t, truth.poses)
 
 
 def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:

@@ -3,7 +3,7 @@
 import os
 import socket
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -51,15 +51,10 @@ def check_recording(file: Path | None, window: bool) -> None:
         check_file_target(file)
     if file is not None or window:
         import_rerun("--view" if window else "--save-view")
-    if window and not has_display(sys.platform, os.environ):
+    if window and sys.platform.startswith("linux") and not any(map(os.environ.get, DISPLAYS)):
         names = " or ".join(DISPLAYS[:2])
         hint = f"--save-view FILE{SUFFIX} writes the recording without a window"
         raise SettingsError(f"--view: expected a display ({names}), found none; {hint}")
-
-
-def has_display(platform: str, environment: Mapping[str, str]) -> bool:
-    """Return whether a window can be opened, as far as the environment tells."""
-    return not platform.startswith("linux") or any(environment.get(name) for name in DISPLAYS)
 
 
 @contextmanager
@@ -204,7 +199,7 @@ class Recorder:
         styles = [  # kind, entity, colour, radius and order of drawing
             *((lines, _path(k, "curve"), color, 1.5, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
             *((lines, _path(k, "tentative"), color, 1.0, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
-            *((lines, _path(k, "band"), pale(color), 0.7, LOW) for k, color in BOUNDARY_COLORS.items()),
+            *((lines, _path(k, "band"), _pale(color), 0.7, LOW) for k, color in BOUNDARY_COLORS.items()),
             *((points, _path(k, "points"), color, 2.0, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
             (points, _path(ORANGE_CONE, "points"), RED, 2.0, MIDDLE),
             (points, _path(BIG_ORANGE, "points"), RED, 3.0, MIDDLE),
@@ -287,8 +282,8 @@ def _path(label: int, part: str) -> str:
     return f"{MAP}/{NAMES[label]}/{part}"
 
 
-def pale(color: str) -> str:
-    """Return a colour "#rrggbb" mixed with as much white."""
+def _pale(color: str) -> str:
+    """Mix a colour "#rrggbb" with as much white."""
     return str(to_hex(0.5 + 0.5 * np.array(to_rgb(color))))
 
 

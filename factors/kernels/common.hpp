@@ -24,7 +24,6 @@ using Shape = std::vector<Index>;
 
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
 constexpr double kTurn = 6.283185307179586;
-constexpr Index kOwn = -2;  // a detection that is the first one of a new cone
 
 inline double clipped(double v, double low, double high) { return std::min(std::max(v, low), high); }
 

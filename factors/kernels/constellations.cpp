@@ -64,6 +64,12 @@ double square3(const double* off, const double* information) {
   return sum;
 }
 
+// The squared Mahalanobis distance of a pose from a mean.
+double lay_away(const double* pose, const double* mean, const double* information) {
+  const double off[3] = {pose[0] - mean[0], pose[1] - mean[1], std::remainder(pose[2] - mean[2], kTurn)};
+  return square3(off, information);
+}
+
 struct LaidPose {
   double pose[3], information[9], square, count, away;
 };
@@ -73,17 +79,17 @@ struct LayStart {
   Index hypothesis;
 };
 
-// The poses about a mean that may cost least: each pair of cones votes for a cell and the eight around it.
-std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known, const double* mean,
-                                 const double* prior, const double* reach, const LayLimits& limits,
-                                 Index hypothesis) {
+// The poses about a centre that may cost least: each pair of cones votes for a cell and the eight around it.
+std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known, const double* centre,
+                                 const double* mean, const double* prior, const double* reach,
+                                 const LayLimits& limits, Index hypothesis) {
   const Index half = static_cast<Index>(std::ceil(reach[0] / limits.cell)) + 1, width = 2 * half + 1;
   const Index turns = static_cast<Index>(std::ceil(reach[1] / limits.turn));
   std::vector<Index> votes(width * width);
   std::vector<LayStart> starts, best;
   const auto more = [](const LayStart& a, const LayStart& b) { return a.score > b.score; };
   for (Index turn = -turns; turn <= turns; ++turn) {
-    const double heading = mean[2] + turn * limits.turn, c = std::cos(heading), s = std::sin(heading);
+    const double heading = centre[2] + turn * limits.turn, c = std::cos(heading), s = std::sin(heading);
     std::fill(votes.begin(), votes.end(), 0);
     for (Index i = 0; i < seen.n; ++i) {
       const double x = seen.point[2 * i], y = seen.point[2 * i + 1];
@@ -92,7 +98,7 @@ std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known
         if (seen.label[i] != known.label[j]) continue;
         Index at[2];
         for (int k = 0; k < 2; ++k) {
-          const double move = known.point[2 * j + k] - to[k] - mean[k];
+          const double move = known.point[2 * j + k] - to[k] - centre[k];
           at[k] = static_cast<Index>(std::floor(clipped(move / limits.cell + 0.5, -1e9, 1e9))) + half;
         }
         if (at[0] <= 0 || at[0] >= 2 * half || at[1] <= 0 || at[1] >= 2 * half) continue;
@@ -103,10 +109,10 @@ std::vector<LayStart> lay_starts(const ConePoints& seen, const ConePoints& known
     best.clear();
     for (Index k = 0; k < width * width; ++k) {
       if (votes[k] == 0) continue;
-      const double off[3] = {(k / width - half) * limits.cell, (k % width - half) * limits.cell,
-                             turn * limits.turn};
-      const double score = limits.gain * votes[k] - std::min(square3(off, prior), limits.failed);
-      best.push_back({score, {mean[0] + off[0], mean[1] + off[1], mean[2] + off[2]}, hypothesis});
+      const double pose[3] = {centre[0] + (k / width - half) * limits.cell,
+                              centre[1] + (k % width - half) * limits.cell, heading};
+      const double score = limits.gain * votes[k] - std::min(lay_away(pose, mean, prior), limits.failed);
+      best.push_back({score, {pose[0], pose[1], pose[2]}, hypothesis});
     }
     std::stable_sort(best.begin(), best.end(), more);
     starts.insert(starts.end(), best.begin(),
@@ -184,28 +190,27 @@ LaidPose lay_refined(const ConePoints& seen, const ConePoints& known, const Arra
       continue;
     }
     std::copy_n(&A[0][0], 9, out.information);
-    double away[3];
-    for (int k = 0; k < 3; ++k) away[k] = out.pose[k] - mean[k];
-    away[2] = std::remainder(away[2], kTurn);
-    out.away = square3(away, prior);
+    out.away = lay_away(out.pose, mean, prior);
   }
   return out;
 }
 
 py::tuple laid(const py::tuple& seen_columns, const py::tuple& known_columns, const Array& views,
-               const Array& means, const Array& prior, const py::tuple& reach, const py::tuple& tuple) {
+               const Array& centres, const Array& means, const Array& prior, const py::tuple& reach,
+               const py::tuple& tuple) {
   const ConePoints seen(seen_columns), all(known_columns);
   const LayLimits limits(tuple);
   expect(means.ndim() == 2 && means.shape(1) == 3 && prior.size() == 9 && views.size() == 5 * views.shape(0));
+  expect(centres.ndim() == 2 && centres.size() == means.size());
   const double within[2] = {reach[0].cast<double>(), reach[1].cast<double>()};
   const double radius = seen.extent() + within[0] + kLayRoom;
   std::vector<ConePoints> known;
   std::vector<LayStart> starts, by_votes, tried;
   for (Index k = 0; k < means.shape(0); ++k) {
-    const double* mean = means.data() + 3 * k;
-    known.push_back(all.near(mean, radius));
-    starts.push_back({0.0, {mean[0], mean[1], mean[2]}, k});
-    const auto found = lay_starts(seen, known.back(), mean, prior.data(), within, limits, k);
+    const double *centre = centres.data() + 3 * k, *mean = means.data() + 3 * k;
+    known.push_back(all.near(centre, radius));
+    starts.push_back({0.0, {centre[0], centre[1], centre[2]}, k});
+    const auto found = lay_starts(seen, known.back(), centre, mean, prior.data(), within, limits, k);
     by_votes.insert(by_votes.end(), found.begin(), found.end());
   }
   std::stable_sort(by_votes.begin(), by_votes.end(),

@@ -19,11 +19,13 @@ void sensor_columns(const double* z, const double* twist, double (*C)[kSensor]) 
 
 Array shifted(const Array& points, const Array& twists, const Array& sensor) {
   const Index m = points.shape(0);
-  expect(points.size() == 2 * m && twists.size() == 3 * m && sensor.size() == kSensor);
+  expect(points.size() == 2 * m && sensor.size() == kSensor);
+  expect(twists.size() == 3 * m || twists.size() == 3);
+  const Index next = twists.size() == 3 ? 0 : 3;  // one twist for all
   Array out(Shape{m, 2});
   double C[2][kSensor];
   for (Index i = 0; i < m; ++i) {
-    sensor_columns(points.data() + 2 * i, twists.data() + 3 * i, C);
+    sensor_columns(points.data() + 2 * i, twists.data() + next * i, C);
     for (int c = 0; c < 2; ++c) {
       double by = 0.0;
       for (Index k = 0; k < kSensor; ++k) by += C[c][k] * sensor.data()[k];

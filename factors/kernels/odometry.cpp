@@ -85,6 +85,30 @@ py::tuple integrated(const Array& durations, const Array& twists, const Array& s
   return py::make_tuple(Array(Shape{3}, end), covariance, by_calibration);
 }
 
+py::tuple held_twists(const Array& stamps, const Array& twists, double until, double first, double interval,
+                      const py::tuple& hold, const Array& accelerations) {
+  const Index k = stamps.size();
+  expect(k > 0 && twists.size() == 3 * k && accelerations.size() == 3);
+  const double* t = stamps.data();
+  for (Index i = 1; i < k; ++i) interval = std::min(interval, t[i] - (i > 1 ? t[i - 1] : first));
+  const double room = std::max(hold[0].cast<double>(), hold[1].cast<double>() * interval);
+  Array durations(k), excess(Shape{k, 3}), none(Shape{3});
+  std::fill_n(none.mutable_data(), 3, 0.0);
+  bool is_long = false, is_missing = false;
+  Index same = 0;
+  for (Index i = 0; i < k; ++i) {
+    const double end = i + 1 < k ? t[i + 1] : until;
+    const double longer = std::max(end - (i ? t[i] : first) - room, 0.0);
+    const double* twist = twists.data() + 3 * i;
+    durations.mutable_data()[i] = end - t[i];
+    for (int c = 0; c < 3; ++c) excess.mutable_data()[3 * i + c] = longer * accelerations.data()[c];
+    is_missing = longer > 0.0;
+    is_long = is_long || is_missing;
+    same += i && std::equal(twist, twist + 3, twist - 3);
+  }
+  return py::make_tuple(durations, is_long ? excess : none, interval, is_missing, same);
+}
+
 Array whitener(const Array& covariance, double least) {
   expect(covariance.size() == 9);
   const double* K = covariance.data();
@@ -182,6 +206,7 @@ void add_odometry(py::module_& module) {
   module.def("whitened_odometry", &whitened_odometry);
   module.def("along_and_across", &along_and_across);
   module.def("odometry_residuals", &odometry_residuals);
+  module.def("held_twists", &held_twists);
   module.def("integrated", &integrated);
   module.def("whitener", &whitener);
 }

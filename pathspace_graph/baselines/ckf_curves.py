@@ -14,10 +14,10 @@ from pathspace_graph.factors.se2 import in_vehicle, path_lengths, rotated, rotat
 from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
-from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
+from pathspace_graph.labels import BOUNDARIES, UNKNOWN
 from pathspace_graph.mapping import path
 from pathspace_graph.mapping.path import END_BEHIND, SIDES, Candidates, End, PathAhead, chain
-from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nearest_within
+from pathspace_graph.mapping.tracks import Tracks, nearest_within
 from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
@@ -150,7 +150,6 @@ class CurveState:
 
 LONGEST_EXTENSION: Final = 12.0  # largest length of one extension (m)
 SIGMA_CARRY: Final = 1.0  # standard deviation of the control point of an extrapolated end (m)
-RECENT_CONES: Final = 40  # number of last cones with which a confirmed track is compared
 END_TOLERANCE_U: Final = 1e-6  # tolerance of a foot point at the end of a curve (m)
 
 
@@ -162,20 +161,19 @@ class Expansion:
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
-        self.tentative = {label: TentativeTracks(settings.growth) for label in BOUNDARIES}
-        self.observed: dict[int, list[Array]] = {label: [] for label in BOUNDARIES}
-        """Distinct confirmed cones, as points (2,) in m, map frame, by label."""
+        self.tentative = Tracks(settings.growth.merge_radius, settings.growth.forget_after)
+        self.observed: dict[int, dict[int, Array]] = {label: {} for label in BOUNDARIES}
+        """Confirmed cones, as points (2,) in m, map frame, by label and number of their track."""
         self._carried = dict.fromkeys(BOUNDARIES, 0.0)  # extrapolated lengths since the last cone (m)
 
     def observe(self, state: CurveState, detections: Detections) -> None:
         """Add all detections of a cycle to the tracks, and newly confirmed ones to the observed cones."""
         points, covariances = in_map(detections, state.pose)
-        add_by_label(self.tentative, detections.labels, points, covariances, detections.t)
-        for label, tentative in self.tentative.items():
-            known, radius = self.observed[label], self.settings.growth.merge_radius
-            for point in tentative.points[tentative.confirmed()]:
-                if not known or np.hypot(*(np.array(known[-RECENT_CONES:]) - point).T).min() > radius:
-                    known.append(point.copy())
+        tracks = self.tentative
+        tracks.add(points, covariances, detections.labels, detections.t)
+        for label, known in self.observed.items():
+            for k in tracks.confirmed(label, self.settings.growth.sightings):
+                known.setdefault(int(tracks.numbers[k]), tracks.points[k].copy())
 
     def expand(
         self, state: CurveState, detections: Detections, path_ahead: PathAhead, free: BoolArray
@@ -199,9 +197,10 @@ class Expansion:
     def _candidates(
         self, state: CurveState, label: int, detections: Detections, rows: IntArray, path_ahead: PathAhead
     ) -> Candidates:
-        settings, tentative = self.settings.growth, self.tentative[label]
+        settings, tentative = self.settings.growth, self.tentative
         points = to_map(detections.points_vehicle[rows], state.pose[None])
-        confirmed = tentative.points[self._undisputed(label, tentative.confirmed())]
+        indices = tentative.confirmed(label, settings.sightings)
+        confirmed = tentative.points[indices[tentative.undisputed(indices, label)]]
         near = nearest_within(points, confirmed, settings.merge_radius)[1]
         stations, lateral = path_ahead.locate(points)
         found = Candidates(points, rows, stations, SIDES[label] * lateral)
@@ -213,13 +212,6 @@ class Expansion:
         if len(found.points):
             found = found.where(self._beyond(state, label, found, end))
         return found.where(chain(found, end))
-
-    def _undisputed(self, label: int, indices: IntArray) -> IntArray:
-        """Select tracks with at least as many detections as the tracks of the other label around them."""
-        tracks, other = self.tentative[label], self.tentative[LEFT + RIGHT - label]
-        offset = tracks.points[indices, None] - other.points
-        near = np.hypot(offset[..., 0], offset[..., 1]) < self.settings.growth.merge_radius
-        return indices[tracks.counts[indices] >= near @ other.counts]
 
     def _beyond(self, state: CurveState, label: int, found: Candidates, end: End) -> BoolArray:
         high, control_points = state.curves[label].domain[1], state.control_points(label)

@@ -1,5 +1,6 @@
 """The paper's filters: the spline filter, which closes its loop, and its landmark baseline (Results)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
@@ -17,15 +18,15 @@ from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
+from pathspace_graph.mapping.tracks import Tracks, nearest_within
 from pathspace_graph.places.constellation import BEGINNING, Constellation, Prior, SampledCurves, beginning_of
 from pathspace_graph.places.find import find, sure
-from pathspace_graph.places.passes import LAP_TURNED, tried_along
+from pathspace_graph.places.passes import tried_along
 from pathspace_graph.run import CycleResult, Stopwatch
-from pathspace_graph.settings.mapper import Knots, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import curvature_weighted_breaks, refit, thin
+from pathspace_graph.spline.bspline import BSpline, sparse_rows
+from pathspace_graph.spline.knots import SAMPLED_WEIGHT, LeastSquares
 
 from .ckf_belief import HEAD, Belief, point_columns
 from .ckf_curves import CurveState, Expansion, OnCurve, classify, in_map, update
@@ -38,6 +39,9 @@ JOIN_MARGIN: Final = 10.0  # with `BEGINNING`, largest distance of the seam from
 JOIN_SHARE: Final = 0.5  # least parameter of the seam on a short curve, as a share of its length
 OVERLAP_STEP: Final = 1.0  # step of the points of the overlap (m)
 OVERLAP_ROOM: Final = 4.0  # search range of their foot points on the beginning, about the expected ones (m)
+PERIODIC_STEP: Final = 0.1  # step of the points of an open curve that a closed one is fitted to (m)
+CURVATURE_MAX: Final = 0.7  # limit of the curvature (1/m), so that a kink does not attract all knots
+SAMPLES_PER_BREAK: Final = 40  # samples of the curvature for each break
 SEAM_MARGIN: Final = 0.5  # distance before the seam within which a cone belongs to the beginning (m)
 
 
@@ -54,40 +58,46 @@ class Overlap:
         return np.where(u < self.u[0], u, self.period + np.interp(u, self.u, self.w))
 
 
-@dataclass(frozen=True, eq=False)
-class PeriodicCurve:
-    """The periodic curve that replaces an open one."""
-
-    overlap: Overlap
-    knots: Array  # (m + 2 p + 1,) periodic knots
-    points: Array  # (m, 2) control points in m, map frame
-    old_from_new: Array  # (n, m) matrix E of the change of variables: `C_old = E C_new`
-
-
 def make_periodic(
-    boundary: Boundary,
-    control_points: Array,
-    settings: MapperSettings,
-    knots: Knots,
-) -> PeriodicCurve:
-    """Fit a periodic curve to an open one with control points (n, 2).
+    boundary: Boundary, control_points: Array, settings: MapperSettings
+) -> tuple[Overlap, BSpline, Array]:
+    """Fit a periodic curve to an open one with control points C (n, 2), on knots by curvature.
 
-    The number of its control points is a share of the number of cones, or of equivalent places on a line.
+    The number of its control points is a share of the number of cones, or of equivalent places on a line. The
+    third result is F of the change of variables, `C_new = F C`.
     """
     spline, overlap = boundary.spline(control_points), find_overlap(boundary, control_points)
     period, u = overlap.period, boundary.cone_parameters
     u = np.arange(0.0, period, LINE_STEP) if settings.of_lines else u
     u = _apart(u[u < period - SEAM_MARGIN], settings.growth.merge_radius)
     size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
-    if knots == "curvature" or size >= len(u):
-        breaks = curvature_weighted_breaks(spline, size, settings.spline.linear_baseline, 0.0, period)
-    else:
-        cones = boundary.evaluate(control_points, u)
-        *_, thinned = thin(cones, u, period, True, boundary.degree, size)
-        breaks = thinned.breaks
+    breaks = curvature_weighted_breaks(spline, size, settings.spline.linear_baseline, 0.0, period)
     frame = BSpline.periodic_from(breaks, np.zeros((len(breaks) - 1, 2)), boundary.degree)
-    change = refit(spline, frame, overlap.new_parameter)
-    return PeriodicCurve(overlap, frame.knots, change.new_from_old @ control_points, change.old_from_new)
+    u = np.linspace(*spline.domain, int(boundary.length / PERIODIC_STEP) + 1)
+    fit = LeastSquares(frame, overlap.new_parameter(u), SAMPLED_WEIGHT)
+    change = fit.solve(sparse_rows(*spline.local_basis(u), spline.size))
+    return overlap, frame.with_points(change @ control_points), change
+
+
+def curvature_weighted_breaks(spline: BSpline, count: int, baseline: float, low: float, high: float) -> Array:
+    """Place breaks (count + 1,) between the parameters low and high of a spline (paper: Simplification).
+
+    They are equal quantiles of the density `(1 - b) |kappa| / integral |kappa| ds + b / length` along the
+    curve, with the linear baseline b. An open curve is straight beyond its ends.
+    """
+    first, last = spline.domain
+    u = np.linspace(low, high, SAMPLES_PER_BREAK * count + 1)
+    middle, even = 0.5 * (u[1:] + u[:-1]), np.hypot(*np.diff(spline.evaluate(u), axis=0).T)
+    bent = np.minimum(np.abs(spline.curvature(middle)), CURVATURE_MAX) * even
+    if not spline.periodic:
+        beyond = (middle < first) | (middle > last)
+        bent[beyond], even[beyond] = 0.0, (u[1] - u[0]) * spline.length() / (last - first)
+    share = even / even.sum()
+    if bent.any():
+        share = (1.0 - baseline) * bent / bent.sum() + baseline * share
+    breaks = np.interp(np.linspace(0.0, 1.0, count + 1), np.append(0.0, np.cumsum(share)), u)
+    breaks[[0, -1]] = low, high
+    return breaks
 
 
 def _apart(values: Array, distance: float) -> Array:
@@ -202,8 +212,7 @@ class CkfMapper(_Filter):
         if too_soon or not state.curves or not self.path.near_beginning(state.pose, settings):
             return
         self._last_check = self.path.length
-        reach = settings.radius_after(self.path.length)
-        motion = associate_early_segment(state, self._recent, self.path.beginning, reach)
+        motion = associate_early_segment(state, self._recent, self.path.beginning)
         if motion is not None and update_by_correspondences(state, motion):
             simplify(state, self.expansion.observed)
             self.closed = True
@@ -218,18 +227,18 @@ class CkfMapper(_Filter):
 
 
 def associate_early_segment(
-    state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array, reach: float
+    state: CurveState, cycles: list[tuple[Array, Detections]], beginning: Array
 ) -> Array | None:
     """Find the motion (3,) of the newest detections onto the beginning of the curves; None if none is sure.
 
-    The beginning is tried within a reach (m), from its poses (k, 3) too.
+    The newest pose is tried at the poses (k, 3) of the beginning, too.
     """
     splines = {label: state.spline(label) for label in state.curves}
     ends = {label: spline.domain[1] for label, spline in splines.items()}
     poses, table = np.array([pose for pose, _ in cycles]), DetectionColumns.of([seen for _, seen in cycles])
     seen = Constellation.of(table, poses, state.settings.growth).seen_from(poses[-1])
     information = np.asarray(np.linalg.inv(state.belief.covariance[:POSE, :POSE]), np.float64)
-    prior = tried_along(beginning, Prior(poses[-1:], information, (reach, LAP_TURNED)))
+    prior, _ = tried_along(beginning, Prior(poses[-1:], information))
     place = sure(find(seen, SampledCurves.of(splines, ends), prior))
     return None if place is None else compose(place.pose, inverse(poses[-1]))
 
@@ -274,21 +283,18 @@ def _overlap(state: CurveState, label: int, motion: Array) -> tuple[Array, Array
     return u[on], foot.u[on]
 
 
-def simplify(state: CurveState, observed: dict[int, list[Array]]) -> None:
+def simplify(state: CurveState, observed: Mapping[int, Mapping[int, Array]]) -> None:
     """Make both curves periodic, on curvature-weighted knots (paper: Simplification)."""
     settings = state.settings
     for label in state.curves:
         boundary = state.boundary(label)
         known = state.control_points(label)
-        cones, zero = np.array(observed[label]).reshape(-1, POINT), np.zeros(len(observed[label]))
+        cones, zero = np.array([*observed[label].values()]).reshape(-1, POINT), np.zeros(len(observed[label]))
         foot = boundary.find(known, cones, zero, zero + boundary.confirmed_end)
         boundary.cone_parameters = np.sort(foot.u)
-        periodic, degree = make_periodic(boundary, known, settings, "curvature"), boundary.degree
-        points = np.concatenate([periodic.points, periodic.points[:degree]])
-        curve = BSpline(periodic.knots, points, degree, periodic=True)
-        matrix = refit(state.spline(label), curve, periodic.overlap.new_parameter).new_from_old
-        state.replace(label, curve, matrix, settings.spline.sigma_simplify)
-        state.pose_u[label] = float(periodic.overlap.new_parameter(np.array([state.pose_u[label]]))[0])
+        overlap, curve, change = make_periodic(boundary, known, settings)
+        state.replace(label, curve, change, settings.spline.sigma_simplify)
+        state.pose_u[label] = float(overlap.new_parameter(np.array([state.pose_u[label]]))[0])
 
 
 class LandmarkCkf(_Filter):
@@ -306,7 +312,8 @@ class LandmarkCkf(_Filter):
     def _begin(self) -> None:
         super()._begin()
         self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
-        self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
+        growth = self.settings.growth
+        self.tentative = Tracks(growth.merge_radius, growth.forget_after)
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
         self.belief.follow(reading.motion)
@@ -350,16 +357,12 @@ class LandmarkCkf(_Filter):
     def _create(self, detections: Detections, new: BoolArray) -> None:
         """Add a landmark for each track that has enough detections beyond the gate of every landmark."""
         points, covariances = in_map(detections, self.belief.pose)
-        chosen = [np.zeros(0, np.intp)]
-        for label, tentative in self.tentative.items():
-            rows = np.flatnonzero(new & (detections.labels == label))
-            tentative.add(points[rows], covariances[rows], detections.t)
-            confirmed = np.flatnonzero(tentative.counts >= self.settings.ckf.sightings)
-            radius = self.settings.growth.merge_radius
-            nearest, near = nearest_within(tentative.points[confirmed], points[rows], radius)
-            chosen.append(rows[np.unique(nearest[near])])
-            tentative.remove(confirmed[near])
-        rows = np.concatenate(chosen)
+        rows, tracks, least = np.flatnonzero(new), self.tentative, self.settings.ckf.sightings
+        numbers = tracks.add(points[rows], covariances[rows], detections.labels[rows], detections.t)
+        confirmed = np.concatenate([tracks.confirmed(label, least) for label in BOUNDARIES])
+        own, first = np.unique(numbers, return_index=True)
+        rows = rows[first[np.isin(own, tracks.numbers[confirmed])]]
+        tracks.remove(confirmed)
         if len(rows):
             self.belief.add_points(detections.points_vehicle[rows], detections.covariances[rows])
             self.labels = np.concatenate([self.labels, detections.labels[rows]])

@@ -12,7 +12,7 @@ from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.graph.smoother import merge_points
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.labels import UNKNOWN
-from pathspace_graph.mapping.tentative import nearest_within
+from pathspace_graph.mapping.tracks import nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import GrowthSettings
 

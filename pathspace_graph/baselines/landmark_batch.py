@@ -17,7 +17,7 @@ from pathspace_graph.io.results import BatchRun
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.mapping.motion import known_noise
-from pathspace_graph.mapping.tentative import TentativeTracks
+from pathspace_graph.mapping.tracks import Tracks
 from pathspace_graph.run import settings_dict, solved, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
@@ -150,28 +150,19 @@ class Reassociation:
         return association.squared_mahalanobis(r.residual, spread + detections.covariance[rows])
 
     def _create(self, free: IntArray) -> None:
-        detections = self.detections
+        """Add landmarks at tracks with enough of the free detections (k,), which they get."""
+        detections, growth, points = self.detections, self.settings.growth, self.points_map
+        covariances = detections.covariances_map(free, self.state.variables)
+        stamps, tracks = self.stamps[detections.cycle[free]], Tracks(growth.merge_radius, np.inf)
+        tracks.add(points[free], covariances, detections.label[free], stamps)
         for label in BOUNDARIES:
             rows = free[detections.label[free] == label]
-            points, cycles = self._confirmed(rows), detections.cycle[rows]
-            new = self.points_map[rows], cycles, points, self.settings.growth
-            chosen, landmark = association.associate_created(*new)
-            numbers = self.state.add(points, np.full(len(points), label, np.intp))
+            new = tracks.points[tracks.confirmed(label, growth.sightings)]
+            chosen, landmark = association.associate_created(
+                points[rows], detections.cycle[rows], new, growth
+            )
+            numbers = self.state.add(new, np.full(len(new), label, np.intp))
             detections.take(rows[chosen], numbers[landmark])
-
-    def _confirmed(self, rows: IntArray) -> Array:
-        """Tracks (k, 2) with enough of these detections, map frame; none is forgotten."""
-        detections = self.detections
-        tentative = TentativeTracks(replace(self.settings.growth, forget_after=np.inf))
-        covariances = detections.covariances_map(rows, self.state.variables)
-        found = [np.zeros((0, POINT))]
-        for cycle in np.unique(detections.cycle[rows]):
-            now = detections.cycle[rows] == cycle
-            tentative.add(self.points_map[rows[now]], covariances[now], float(self.stamps[cycle]))
-            confirmed = tentative.confirmed()
-            found.append(tentative.points[confirmed])
-            tentative.remove(confirmed)
-        return np.concatenate(found)
 
 
 def relabel(

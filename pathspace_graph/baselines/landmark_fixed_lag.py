@@ -13,7 +13,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.residuals import chi2_quantile
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.smoother import FixedLagSmoother, restart, set_prior
-from pathspace_graph.graph.variables import NO_KEYS, ONE_DRIVE, POINT
+from pathspace_graph.graph.variables import ONE_DRIVE, POINT
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
@@ -21,7 +21,7 @@ from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.mapping import motion as motions
 from pathspace_graph.mapping.motion import predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
+from pathspace_graph.mapping.tracks import Tracks, nearest_within
 from pathspace_graph.run import CycleResult, Readings, Stopwatch
 
 from . import landmark_association as association
@@ -58,10 +58,11 @@ class LandmarkFixedLag(OnlineBaseline):
         self.smoother = FixedLagSmoother(motions.smoother_settings(self.settings), LandmarkMap(self.settings))
         self.smoother.window.exact = True
         self.path = DrivenPath()
-        self.tentative = {label: TentativeTracks(self.settings.growth) for label in BOUNDARIES}
+        growth = self.settings.growth
+        self.tentative = Tracks(growth.merge_radius, growth.forget_after)
         self.inflated = self.settings  # settings with the present priors of the calibrations
         self.closed = False
-        self.record = DriveRecord(self.settings)
+        self.record = DriveRecord()
         self._left: list[tuple[Array, IntArray]] = []
         """Poses (k, 3) that left the window, and landmarks (m,) of their detections, as of then."""
         self._last_detected: Array = np.zeros(
@@ -110,12 +111,13 @@ class LandmarkFixedLag(OnlineBaseline):
 
     def _create(self, new: slice, t: float) -> bool:
         detections, created = self.smoother.map.detections, False
-        free = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
-        for label, tentative in self.tentative.items():
-            rows = free[detections.label[free] == label]
-            points, variables = detections.points_map(rows, self.smoother.variables), self.smoother.variables
-            tentative.add(points, detections.covariances_map(rows, variables), t)
-            confirmed = tentative.confirmed()
+        rows = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
+        variables, tentative = self.smoother.variables, self.tentative
+        points = detections.points_map(rows, variables)
+        covariances = detections.covariances_map(rows, variables)
+        tentative.add(points, covariances, detections.label[rows], t)
+        for label in BOUNDARIES:
+            confirmed = tentative.confirmed(label, self.settings.growth.sightings)
             if len(confirmed):
                 self._add_landmarks(label, tentative.points[confirmed].copy())
                 tentative.remove(confirmed)
@@ -190,7 +192,7 @@ class LandmarkFixedLag(OnlineBaseline):
         system = LandmarkSystem(detections, drive.chain, self.inflated, noise)
         solved = self.whole_drive(detections)
         system.optimize(solved)
-        restart(smoother, first, NO_KEYS, NO_KEYS, np.zeros((0, POINT)))
+        restart(smoother, first)
         variables = smoother.variables
         variables.values = solved.variables.values[solved.variables.layout.entries(variables.keys)]
         set_prior(smoother, *system.marginal(solved, first))

@@ -15,7 +15,14 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import restored
 from pathspace_graph.front_end.front_end import is_orange, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
-from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph, marginal_before, owners
+from pathspace_graph.graph.elimination import (
+    Damping,
+    Elimination,
+    linear_graph,
+    marginal_before,
+    owners,
+    solution,
+)
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import (
@@ -275,11 +282,19 @@ class LandmarkSystem:
         return Elimination(graph, state.variables.layout)
 
     def optimize(self, state: LandmarkState) -> None:
-        """Optimize a state by Levenberg-Marquardt with fixed associations; only the map is damped."""
+        """Optimize a state by Levenberg-Marquardt with fixed associations; landmarks are damped (1/m^2)."""
         variables, cost, damping = state.variables, self.cost(state), Damping()
+        keys = np.repeat(state.keys, POINT)[:, None]
+        still = Rows(
+            keys,
+            np.tile(np.eye(POINT), (len(state), 1)),
+            np.zeros(len(keys)),
+            -1 - np.arange(len(keys)) // POINT,
+        )
         for _ in range(MAX_STEPS):
-            problem, before = self.eliminated(state), variables.values
-            variables.values = before + problem.step(damping.weight * np.diagonal(problem.information))
+            damped = replace(still, jacobian=np.sqrt(damping.weight) * still.jacobian)
+            rows, before = self.rows(state, self.settings.gate.huber), variables.values
+            variables.values = before + solution(linear_graph([*rows, damped], variables), variables.layout)
             gain = cost - self.cost(state)
             if gain < 0.0:
                 variables.values = before

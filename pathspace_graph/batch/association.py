@@ -1,11 +1,14 @@
 """Association in a batch: poses along the curves, detections on curves and stations, and of cones."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
@@ -17,7 +20,7 @@ from pathspace_graph.mapping.detection_rows import SIGMA_POSE, Stations
 from pathspace_graph.mapping.detections import NO_STATION, DetectionTable
 from pathspace_graph.mapping.path import LATERAL_GAP, ROW_BESIDE, SIDES, in_front_row
 from pathspace_graph.mapping.state import State
-from pathspace_graph.mapping.tentative import nearest_within
+from pathspace_graph.mapping.tracks import nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION, ahead_of
 
@@ -38,6 +41,7 @@ COURSE: Final = 2.0  # stretch of a drive that gives its direction (m)
 POSE_ROOM: Final = (
     2.0  # largest excess of the distance of two poses along an open curve over the driven one (m)
 )
+NEAREST: Final = 8  # number of a curve's samples that are nearest to a pose, before all of them are searched
 FOLD_COSINE: Final = 0.5  # a row folds back where the cosine of its turn is below minus this
 FOLD_DISTANCE: Final = (
     1.5  # distance from its nearer neighbour below which a cone at a fold is a duplicate (m)
@@ -72,16 +76,43 @@ def locate_poses(state: State) -> None:
         u = boundary.tables.low + boundary.length * (np.arange(count) + 0.5) / count
         position, tangent = (boundary.evaluate(state.control_points(label), u, order) for order in (0, 1))
         tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
-        square = (poses[:, :1] - position[:, 0]) ** 2
-        square += (poses[:, 1:2] - position[:, 1]) ** 2
-        against = np.maximum(headings(poses) @ tangent.T, courses @ tangent.T) < SAME_DIRECTION
-        np.add(square, DIRECTION_PENALTY**2, out=square, where=against)
+        against = partial(_against, (headings(poses), courses), tangent)
         if boundary.periodic:
-            state.pose_u[label] = _from_lap_to_lap(u[square.argmin(axis=1)], boundary.length, state.drives)
+            near = nearest_by(poses[:, :2], position, against)
+            state.pose_u[label] = _from_lap_to_lap(u[near], boundary.length, state.drives)
         else:
+            square = cdist(poses[:, :2], position, "sqeuclidean")
+            square += against(*np.ogrid[: len(poses), :count])
             driven = np.hypot(*np.diff(poses[:, :2], axis=0).T) + POSE_ROOM
             driven[state.drives.begins(len(poses))] = boundary.length
             state.pose_u[label] = u[_along(square, driven * count / boundary.length)]
+
+
+def _against(ways: tuple[Array, Array], tangent: Array, i: IntArray, j: IntArray) -> Array:
+    """Return the penalty (m^2) of samples j of a curve that run along neither of the ways of poses i."""
+    alike = [(way[i] * tangent[j]).sum(axis=-1) for way in ways]
+    return np.where(np.maximum(*alike) < SAME_DIRECTION, DIRECTION_PENALTY**2, 0.0)
+
+
+Penalty = Callable[[IntArray, IntArray], Array]
+"""Penalty (m^2, not negative) of known points j for points i, given by indices that are broadcast."""
+
+
+def nearest_by(points: Array, known: Array, penalty: Penalty) -> IntArray:
+    """Return the index (m,) of the known point (n, 2) of least squared distance and penalty from each point.
+
+    The nearest few decide, or all where these cannot.
+    """
+    few = np.arange(1, min(NEAREST, len(known)) + 1)
+    distance, near = map(np.asarray, KDTree(known).query(points, few))
+    rows = np.arange(len(points))
+    square = distance**2 + penalty(rows[:, None], near)
+    best = square.argmin(axis=1)
+    nearest = np.asarray(near[rows, best], np.intp)
+    others = np.flatnonzero(square[rows, best] > distance[:, -1] ** 2)
+    square = cdist(points[others], known, "sqeuclidean") + penalty(others[:, None], np.arange(len(known)))
+    nearest[others] = square.argmin(axis=1)
+    return nearest
 
 
 def _from_lap_to_lap(u: Array, length: float, drives: Drives) -> Array:
@@ -257,8 +288,14 @@ def cones_of_curve(state: State, detections: DetectionTable, label: int, setting
         longest = state.drives.longest(len(state.poses))
         poses, pose_u = state.poses[longest], state.pose_u[label][longest]
         lap = pose_u > pose_u[-1] - boundary.length  # the last one
-        apart = ahead_of(pose_u[lap], cones.u[:, None] + begin, boundary.length)
-        cones = along_drive(cones, poses[lap], np.abs(apart) < PASS_STRETCH, label)
+        u, pose_u = cones.u + begin, pose_u[lap]
+
+        def apart(i: IntArray, j: IntArray) -> Array:
+            """Penalty (m^2) of poses j beside another stretch of the curve than that of cones i."""
+            away = np.abs(ahead_of(pose_u[j], u[i], boundary.length))
+            return np.where(away >= PASS_STRETCH, DIRECTION_PENALTY**2, 0.0)
+
+        cones = along_drive(cones, poses[lap], apart, label)
     if len(detections.drives) > 1:
         cones = cones.where(seen_by_most(state, label, cones, points, cycles, settings))
     return without_folds(cones, boundary.periodic)
@@ -297,15 +334,14 @@ def feet_of_cones(state: State, cones: Cones, label: int) -> FootPoints:
     return boundary.find(state.control_points(label), cones.points, u - FOOT_ROOM, u + FOOT_ROOM)
 
 
-def along_drive(cones: Cones, lap: Array, own: BoolArray, label: int) -> Cones:
+def along_drive(cones: Cones, lap: Array, apart: Penalty, label: int) -> Cones:
     """Select the cones of the row nearest to the poses (l, 3) of a lap, in the order in which these pass it.
 
-    `own` (k, l) marks the poses beside each cone's own stretch of the curve: if one row bounds two lanes, the
-    poses of the other lane may be nearer. A cone behind the row belongs to another stretch, or is smeared
-    between two rows by far detections.
+    `apart` is the penalty of poses beside another stretch of the curve than a cone: if one row bounds two
+    lanes, the poses of the other lane may be nearer. A cone behind the row belongs to another stretch, or is
+    smeared between two rows by far detections.
     """
-    square = ((cones.points[:, None] - lap[:, :2]) ** 2).sum(axis=2)
-    nearest = np.add(square, DIRECTION_PENALTY**2, out=square, where=~own).argmin(axis=1)
+    nearest = nearest_by(cones.points, lap[:, :2], apart)
     ahead, left = to_vehicle(cones.points, lap[nearest]).T
     station, side = path_lengths(lap)[nearest] + ahead, SIDES[label] * left
     front = in_front_row(station, side, ROW_BESIDE, LATERAL_GAP)
@@ -448,7 +484,8 @@ def match_stations(
         return None
     places = {}
     for label in state.boundaries:
-        first = detections.where(np.flatnonzero(laps_of(state, detections, label) <= 0)).of_drive(0)
+        laps = laps_of_detections(state, detections, label)
+        first = detections.where(np.flatnonzero(laps <= 0)).of_drive(0)
         cones = cones_of_curve(state, first, label, settings)
         if len(cones.u) < ROW_CONES:
             return None
@@ -469,7 +506,7 @@ def match_stations(
     return StationMatches(stations, *map(np.concatenate, (rows, station, sigma)))
 
 
-def laps_of(state: State, detections: DetectionTable, label: int) -> IntArray:
+def laps_of_detections(state: State, detections: DetectionTable, label: int) -> IntArray:
     """Lap (m,) on a closed curve in which each detection's foot point was passed, from 0."""
     pose_u, length = state.pose_u[label], state.boundaries[label].length
     at = pose_u[detections.cycle]

@@ -12,16 +12,14 @@ from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.gtsam_factors import (
     fill,
     pose_array,
-    smoothness_factors,
     spline_projection_factors,
     station_factors,
 )
-from pathspace_graph.factors.residuals import smoothness_matrix
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.rows import odometry_factor
-from pathspace_graph.graph.variables import CALIBRATION_KEY, POINT, POSE, pose_key, pose_keys
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, pose_key
 from pathspace_graph.mapping.detection_rows import DetectionRows
-from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.gtsam_graph import seen_on, weak_priors
 from pathspace_graph.spline.boundary import Boundary
 
 from .system import BatchSystem, CurveGauge, Evaluation
@@ -41,11 +39,10 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     the graph has the linearization of the optimization, but its error is not the robust cost. SettingsError
     for several drives.
     """
-    if len(at.state.drives) > 1:
-        raise SettingsError(f"graph: expected the batch of one drive, found {len(at.state.drives)} drives")
     factors, graph = [*drive_factors(system, at)], gtsam.NonlinearFactorGraph()
     for label, gauge in system.gauges.items():
-        factors += _priors(gauge, at.state)
+        factors += [factor_beside(gauge, j) for j in range(len(gauge.keys))]
+        factors += weak_priors(at.state, label, at.state.boundaries[label].everything)
         factors += [*_across(system, at, label), *_along(system, at, label)]
     for factor in factors:
         graph.add(factor)
@@ -53,8 +50,10 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
 
 
 def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield all factors without control points, those of the user last."""
-    for k, interval in enumerate(system.chain.odometry.intervals):
+    """Yield factors of poses and calibrations, and the user's; SettingsError for several drives."""
+    if len(at.state.drives) > 1:
+        raise SettingsError(f"graph: expected the batch of one drive, found {len(at.state.drives)} drives")
+    for k, interval in enumerate(system.chains[0].odometry.intervals):
         yield odometry_factor(k, interval)
     for one in system.revisits:
         root = one.root.copy()  # GTSAM's tangents are in the frame of the later pose
@@ -62,7 +61,7 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
         noise = gtsam.noiseModel.Gaussian.Information(root.T @ root)
         ends = pose_key(one.earlier), pose_key(one.later)
         yield gtsam.BetweenFactorPose2(*ends, gtsam.Pose2(*one.local), noise)
-    chain, calibration, noises = system.chain, system.settings.calibration, gtsam.noiseModel
+    chain, calibration, noises = system.chains[0], system.settings.calibration, gtsam.noiseModel
     map_from_pose = np.eye(POSE)  # GTSAM's tangents of a pose are in its own frame
     map_from_pose[:2, :2] = rotation(at.state.poses[0, 2])
     noise = noises.Gaussian.Information(map_from_pose.T @ chain.first_information @ map_from_pose)
@@ -77,18 +76,6 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
         sigmas = noises.Diagonal.Sigmas(np.array(calibration.sigmas))
         yield gtsam.PriorFactorVector(sensor_key, np.array(calibration.means), sigmas)
     yield from system.own
-
-
-def _priors(gauge: CurveGauge, state: State) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield the weak priors of a curve's control points: slide along it, smoothness, and anchors."""
-    label, boundary = gauge.label, state.boundaries[gauge.label]
-    anchor = gtsam.noiseModel.Isotropic.Sigma(POINT, boundary.gauge.sigma_anchor)
-    for j, (key, point) in enumerate(zip(gauge.keys.tolist(), state.control_points(label), strict=True)):
-        yield factor_beside(gauge, j)
-        yield gtsam.PriorFactorPoint2(key, point, anchor)
-    matrix = smoothness_matrix(boundary.abscissae, boundary.length if boundary.periodic else None)
-    sigma = boundary.gauge.sigma_smoothness * float(np.mean(boundary.nominal))
-    yield from smoothness_factors(gauge.keys.tolist(), matrix, sigma)
 
 
 def factor_beside(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
@@ -133,17 +120,8 @@ def _measured(
     """Return whether detections (m,) of a boundary have a weight, and the arguments of their factors."""
     detections, scale = system.detections, seen.scale(system.kernel.weights(seen.whitened))
     chosen = (detections.boundary[seen.rows] == label) & (scale > 0.0)
-    rows = seen.rows[chosen]
-    return chosen, {
-        "pose_keys": pose_keys(detections.cycle[rows]),
-        "control_keys": at.state.keys(label).tolist(),
-        "tables": at.state.boundaries[label].tables,
-        "points_vehicle": detections.measured[rows],
-        "covariances": scale[chosen, None, None] ** -2.0 * np.eye(2),
-        "twists": detections.twist[rows],
-        "huber": np.inf,
-        "sensor_key": at.state.variables.sensor_key,
-    }
+    covariances = scale[chosen, None, None] ** -2.0 * np.eye(2)
+    return chosen, seen_on(at.state, detections, label, seen.rows[chosen], covariances, np.inf)
 
 
 def _room(boundary: Boundary, control_points: Array, points: Array, u: Array) -> Array:

@@ -1,8 +1,7 @@
 """Several drives of one track as one problem: one set of curves, and a chain of poses for each drive.
 
-Cycles are numbered consecutively over all drives, without odometry between drives. Each drive has its own
-calibration; drives of one vehicle share the sensor's. Common observations connect the drives: curves, their
-stations, and poses of a later drive in the frame of an earlier one.
+Common observations connect the drives: curves, their stations, and poses of a later drive in the frame of an
+earlier one.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,16 +16,12 @@ from pathspace_graph.errors import SettingsError, SolveError, solving
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import compose, inverse, move_points, path_lengths
-from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.front_end.log_odometry import LogOdometry
-from pathspace_graph.graph.elimination import owners
-from pathspace_graph.graph.rows import Revisit, Rows
+from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
     SENSOR_KEY,
     Drives,
-    are_poses,
-    of_sensor,
     pose_keys,
 )
 from pathspace_graph.io.log import Log
@@ -36,18 +31,17 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.places.constellation import Constellation, Prior
 from pathspace_graph.places.find import KnownRoad, find, sure
-from pathspace_graph.places.passes import NEARBY, find_return, revisit_of, seen_in
+from pathspace_graph.places.passes import STRETCH, find_return, revisit_of, seen_in
 from pathspace_graph.run import Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .association import locate_poses
 from .lap import disagreement
-from .mapper import BatchMapper, BatchResult, Found, frame_of, map_of, result_of, with_wider_priors
+from .mapper import BatchMapper, BatchResult, Found, frame_of_drive, map_of, result_of, with_wider_priors
 from .optimizer import Optimizer
 from .simplification import boundary_of
+from .start import REVISIT_INTERVAL
 from .system import BatchSystem
-
-REVISIT_INTERVAL: Final = 20.0  # distance of the places at which a drive is laid on earlier ones (m driven)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +55,7 @@ class PlacedDrive:
 
     @property
     def chain(self) -> LogOdometry:
-        return self.alone.system.chain
+        return self.alone.system.chains[0]
 
     @property
     def state(self) -> State:
@@ -87,70 +81,26 @@ def drives_of(placed: Sequence[PlacedDrive]) -> Drives:
     return Drives(tuple(first), tuple(known.index(name) for name in names))
 
 
-class JointSystem(BatchSystem):
-    """The problem of several drives with one set of curves."""
-
-    def __init__(self, placed: Sequence[PlacedDrive]) -> None:
-        self.placed, self.drives = tuple(placed), drives_of(placed)
-        detections = DetectionTable.of_drives([one.alone.system.detections for one in placed], self.drives)
-        own = [
-            replace(one, earlier=one.earlier + begin, later=one.later + begin)
-            for drive, begin in zip(placed, self.drives.first, strict=True)
-            for one in drive.alone.system.revisits
-        ]
-        super().__init__(detections, placed[0].chain, placed[0].settings, own)
-        self.chains = [one.chain for one in placed]  # the odometry of each drive
-        self.priors = [one.settings for one in placed]
-
-    def widen_priors(self, drive: int, settings: MapperSettings) -> None:
-        """Take the priors of a drive's calibrations from other settings."""
-        sigma = np.array(settings.odometry.sigmas)
-        self.priors[drive] = settings
-        self.chains[drive] = replace(self.chains[drive], calibration_sigma=sigma)
-
-    def drive_rows(self, state: State) -> list[Rows]:
-        """Rows of odometry and calibrations of each drive; only the first has a prior of its first pose."""
-        groups, variables = list[Rows](), state.variables
-        calibrations = variables.calibration.reshape(-1, CALIBRATION_SIZE)
-        for d, part in enumerate(self.drives.parts(len(state.poses))):
-            chain, poses, calibration = self.chains[d], state.poses[part], calibrations[d]
-            own = [chain.odometry_rows(poses, calibration)]
-            own += chain.calibration_priors(calibration) if d else chain.priors(poses[0], calibration)
-            groups += [in_drive(rows, d, part.start) for rows in own]
-        return groups + self._sensor_priors(state)
-
-    def _sensor_priors(self, state: State) -> list[Rows]:
-        """Rows of the prior of each sensor, from its first drive."""
-        groups, sensors = [], state.variables.sensor
-        for number in range(len(sensors) // SENSOR_SIZE):
-            prior = self.priors[self.drives.sensors.index(number)].calibration
-            root = np.diag(1.0 / np.array(prior.sigmas))
-            residual = root @ (of_sensor(sensors, number) - prior.means)
-            keys = np.full((SENSOR_SIZE, 1), SENSOR_KEY + number)
-            groups.append(Rows(keys, root, residual, np.zeros(SENSOR_SIZE, np.intp)))
-        return groups
-
-    def disagreement_of(self, drive: int, state: State) -> str:
-        """Describe how the poses of a drive contradict its odometry; empty if they agree."""
-        poses = state.poses[self.drives.parts(len(state.poses))[drive]]
-        one = self.placed[drive]
-        back = compose(one.state.poses[0], inverse(poses[0]))
-        calibration = state.variables.calibration.reshape(-1, CALIBRATION_SIZE)[drive]
-        return disagreement(one.alone.system, compose(back, poses), calibration)
+def joint_system(placed: Sequence[PlacedDrive]) -> BatchSystem:
+    """Build the problem of several drives with one set of curves, and the revisits of each alone."""
+    drives = drives_of(placed)
+    revisits = [
+        replace(one, earlier=one.earlier + begin, later=one.later + begin)
+        for drive, begin in zip(placed, drives.first, strict=True)
+        for one in drive.alone.system.revisits
+    ]
+    detections = DetectionTable.of_drives([one.alone.system.detections for one in placed], drives)
+    chains, priors = [one.chain for one in placed], [one.settings for one in placed]
+    return BatchSystem(detections, chains, priors, revisits)
 
 
-def in_drive(rows: Rows, number: int, first_cycle: int) -> Rows:
-    """Renumber rows of a drive alone, by its number and first cycle among several drives."""
-    keys = rows.keys + np.where(are_poses(rows.keys), first_cycle, number)
-    return replace(rows, keys=keys, owner=rows.owner + owners(np.array(first_cycle)))
-
-
-def joint_state(system: JointSystem, known: PlacedDrive) -> State:
+def joint_state(placed: Sequence[PlacedDrive], known: PlacedDrive) -> State:
     """Build a state of the curves of one drive and the poses of all, each as placed alone."""
-    state, placed, drives = State(drives=system.drives), system.placed, system.drives
+    drives = drives_of(placed)
+    state = State(drives=drives)
     for label, spline in known.state.splines.items():
         curve = replace(spline, control_points=move_points(known.motion, spline.control_points))
-        state.add_boundary(label, *boundary_of(curve, system.settings))
+        state.add_boundary(label, *boundary_of(curve, placed[0].settings))
     variables, poses = state.variables, np.concatenate([one.poses for one in placed])
     own = np.concatenate([one.state.variables.calibration for one in placed])
     variables.insert(CALIBRATION_KEY + np.arange(len(placed)), own)
@@ -164,31 +114,37 @@ def joint_state(system: JointSystem, known: PlacedDrive) -> State:
     return state
 
 
-def revisits_between(system: JointSystem, state: State) -> list[Revisit]:
+def revisits_between(system: BatchSystem, state: State) -> list[Revisit]:
     """Return poses of each later drive in the frame of one of an earlier drive, by their common cones."""
     settings, found = system.settings, list[Revisit]()
     table = system.detections.cones(settings.of_lines)
     table.correct(state.variables.sensor)
     driven = path_lengths(state.poses)
-    for part in system.drives.parts(len(driven))[1:]:
+    for part in state.drives.parts(len(driven))[1:]:
         before, due = float(driven[part.start]), REVISIT_INTERVAL
         for newest in range(part.start, part.stop):
             if driven[newest] - before < due:
                 continue
             due = driven[newest] - before + REVISIT_INTERVAL
             poses = state.poses[: newest + 1]
-            again = find_return(seen_in(table), poses, before, Prior.about(poses[-1], *NEARBY), settings)
+            again = find_return(seen_in(table), poses, before, settings)
             if again is not None:
                 found.append(revisit_of(again[0], poses, again[1], newest))
     return found
+
+
+def disagreement_of(placed: PlacedDrive, number: int, state: State) -> str:
+    """Describe how the poses of a drive contradict its odometry; empty if they agree."""
+    poses = state.poses[state.drives.parts(len(state.poses))[number]]
+    back = compose(placed.state.poses[0], inverse(poses[0]))
+    calibration = state.variables.calibration.reshape(-1, CALIBRATION_SIZE)[number]
+    return disagreement(placed.alone.system, compose(back, poses), calibration)
 
 
 # --- the place of a drive --------------------------------------------------------------------------------
 
 
 LEAST_DRIVEN: Final = 30.0  # least length of a drive (m)
-PLACED_STRETCH: Final = 60.0  # length of a stretch of a drive that determines its place (m)
-FROM_START: Final = 60.0  # length of the first path, whose cones determine the place on an open road (m)
 ABOUT_START: Final = (5.0, 2.0, 0.1), (15.0, 0.3)
 """Sigmas (m, m, rad) and largest distance (m, rad) of the starts of two drives of an open road."""
 
@@ -236,8 +192,8 @@ def find_place(known: Driven, drive: Driven) -> Array:
     if drive.driven[-1] < LEAST_DRIVEN:
         raise NotPlacedError(f"it is shorter than {LEAST_DRIVEN:g} m")
     if not known.state.closed:
-        places = find(drive.seen(0.0, FROM_START), known.road.seen, Prior.about(np.zeros(3), *ABOUT_START))
-        if (place := sure(places)) is None:
+        begin = find(drive.seen(0.0, STRETCH), known.road.seen, Prior.about(np.zeros(3), *ABOUT_START))
+        if (place := sure(begin)) is None:
             raise NotPlacedError(OTHER_START)
         return place.pose
     motion, found = _by_stretches(known.road, drive)
@@ -251,15 +207,15 @@ def find_place(known: Driven, drive: Driven) -> Array:
 
 def _by_stretches(road: KnownRoad, drive: Driven) -> tuple[Array | None, bool]:
     """Return the motion of the first stretch with a sure place, and whether one fits anywhere."""
-    fits, ends = False, np.arange(PLACED_STRETCH, float(drive.driven[-1]) + PLACED_STRETCH, PLACED_STRETCH)
+    fits, ends = False, np.arange(STRETCH, float(drive.driven[-1]) + STRETCH, STRETCH)
     for end in np.minimum(ends, drive.driven[-1]).tolist():
-        within = (drive.driven >= end - PLACED_STRETCH) & (drive.driven <= end)
+        within = (drive.driven >= end - STRETCH) & (drive.driven <= end)
         poses = drive.state.poses[within]
-        seen = drive.seen(end - PLACED_STRETCH, end).seen_from(poses[-1])
-        places = find(seen, road.seen, road.along(poses))
-        if (place := sure(places)) is not None:
+        seen = drive.seen(end - STRETCH, end).seen_from(poses[-1])
+        place = find(seen, road.seen, road.along(poses))
+        if place is not None and sure(place):
             return compose(place.pose, inverse(poses[-1])), True
-        fits |= bool(places) and places[0].odds > -np.inf
+        fits |= place is not None and place.odds > -np.inf
     return None, fits
 
 
@@ -368,12 +324,12 @@ class _Joint:
     def solve(self) -> None:
         """Search the optimum, again without drives that contradict it."""
         base = base_of({one.name: one.alone for one in self.placed})
-        self.system = JointSystem(self.placed)
-        state = joint_state(self.system, next(one for one in self.placed if one.name == base))
-        self.system.revisits += tuple(revisits_between(self.system, state))
-        optimizer = Optimizer(self.system, on_round=self._on_round)
+        system = joint_system(self.placed)
+        state = joint_state(self.placed, next(one for one in self.placed if one.name == base))
+        system.revisits += tuple(revisits_between(system, state))
+        optimizer = Optimizer(system, on_round=self._on_round)
         found = Found(optimizer, *optimizer.find(state))
-        why = {one.name: self.system.disagreement_of(d, found.at.state) for d, one in enumerate(self.placed)}
+        why = {one.name: disagreement_of(one, d, found.at.state) for d, one in enumerate(self.placed)}
         wrong = {name: reason for name, reason in why.items() if reason}
         if wrong and len(wrong) < len(self.placed):
             self.left_out |= wrong
@@ -399,7 +355,7 @@ class _Joint:
                 drive=d,
             )
             drives[one.name] = scaled(drive, scale)
-            frames[one.name] = frame_of(one.chain, drive.trajectory) * [scale, scale, 1.0]
+            frames[one.name] = frame_of_drive(one.chain, drive.trajectory) * [scale, scale, 1.0]
         return JointResult(drives, frames, {})
 
     def _orange(self) -> dict[int, PointBoundary]:

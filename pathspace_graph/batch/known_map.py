@@ -96,7 +96,7 @@ def map_of_cones(
     """Build a map through cones (n, 2) in driving order, known with a standard deviation `sigma` (m)."""
     settings, boundaries = known_settings(settings), dict[int, SplineBoundary]()
     for label, cones in zip(BOUNDARIES, (left, right), strict=True):
-        spline = fit_through(cones, closed, settings, settings.batch.dense_share)
+        spline, _ = fit_through(cones, closed, settings, settings.batch.dense_share)
         floating = spline if closed else spline.unclamp()
         covariance = sigma**2 * np.eye(POINT * floating.size)
         placed = np.column_stack([_places(floating, cones), np.full(len(cones), sigma)])

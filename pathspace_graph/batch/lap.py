@@ -23,11 +23,11 @@ from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import path_lengths, to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import marginal_before
-from pathspace_graph.graph.rows import Revisit, Rows
+from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.state import SAMPLE, State
+from pathspace_graph.mapping.state import SAMPLE, GivenFactor, State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import (
     Boundary,
@@ -39,7 +39,7 @@ from pathspace_graph.spline.boundary import (
 from pathspace_graph.spline.bspline import BSpline
 
 from .association import StationMatches
-from .optimizer import Convergence, Effort, Optimizer
+from .optimizer import Convergence, Effort, Optimizer, Stage
 from .simplification import map_block, own_settings, simplified
 from .start import StartMap, aligned_odometry, start_odometry
 from .system import BatchSystem, Evaluation, curve_gauge
@@ -59,7 +59,8 @@ class OpenLap:
     first_kept: int  # first cycle whose pose stays a variable of the window
     start: StartMap | None  # None for a start from odometry, whose first revisit ended the lap
     revisits: tuple[Revisit, ...] = ()
-    factors: tuple[Rows, ...] = ()  # the user's factors on poses, at values of zero
+    factors: tuple[GivenFactor, ...] = ()
+    """The user's factors that began before `first_kept`, as linearized when they were given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,12 +138,13 @@ def lap_optimum(lap: OpenLap, effort: Effort | None = None) -> tuple[BatchSystem
     """
     start = lap.start
     settings = lap.settings if start is not None and start.is_open else own_settings(lap.settings)
-    system = BatchSystem(lap.detections.copy(), lap.chain, settings, lap.revisits, lap.factors)
+    system = BatchSystem(lap.detections.copy(), [lap.chain], [settings], lap.revisits, lap.factors)
     if start is None:
         return system, *Optimizer(system, effort or FROM_ODOMETRY).find(start_odometry(system))
     optimizer = Optimizer(system, effort or FROM_MAP)
     if start.is_open:
-        return system, *optimizer.run(start.state(settings), settings.batch.gate, optimizer.effort.rounds)
+        alone = Stage(settings.batch.gate, optimizer.effort.rounds, optimizer.effort.tolerance)
+        return system, *optimizer.run(start.state(settings), alone)
     return system, *optimizer.find(start.state(settings))
 
 
@@ -292,7 +294,7 @@ def disagreement(
     if not system.revisits:
         return ""
     revisits = system.revisits if revisits is None else revisits
-    calibrated = replace(system.chain, calibration_mean=calibration)
+    calibrated = replace(system.chains[0], calibration_mean=calibration)
     sigmas = aligned_odometry(calibrated, revisits).disagreement(poses)
     return f"the poses are {sigmas:.1f} sigmas from the odometry" if sigmas > BENT_SIGMAS else ""
 

@@ -16,6 +16,7 @@ from pathspace_graph.factors.se2 import compose, inverse
 from pathspace_graph.front_end.front_end import JudgedLog, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
+from pathspace_graph.graph.exchange import pose_graph
 from pathspace_graph.graph.gaussian import FactoredSystem, cholesky
 from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.graph.variables import (
@@ -29,28 +30,28 @@ from pathspace_graph.graph.variables import (
 from pathspace_graph.graph.window import check_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary, joint_covariance
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE_LENGTHS
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import known_noise, vehicle_of, with_inflated_priors, with_size
-from pathspace_graph.mapping.orange import Sighting, orange_cones
+from pathspace_graph.mapping.orange import OrangeDetections, orange_cones
 from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict, solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
-from .gtsam_graph import nonlinear_graph
+from .gtsam_graph import drive_factors, nonlinear_graph
 from .lap import evidence_against, unmapped
 from .optimizer import Convergence, Optimizer
 from .simplification import Scatter, Simplified, map_block, own_settings, simplified
 from .start import CurveMapper, find_revisits, start_odometry, start_online
-from .system import BatchSystem, Evaluation
+from .system import BatchSystem, Evaluation, OwnFactors
 
 NAME: Final = "spline"  # name of the estimator on the command line
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class BatchResult(BatchRun):
     """Result of a batch optimization, its convergence, and its uncertainty."""
 
@@ -88,17 +89,23 @@ class BatchResult(BatchRun):
             lengths = self.optimum.state.poses * [1.0, 1.0, 0.0]
             size = self.system.settings.odometry.sigma_size
             marginals = marginals + size**2 * lengths[:, :, None] * lengths[:, None, :]
-            return (np.outer(weights, weights) * marginals)[self.cycles_of_drive]
-
-    @property
-    def cycles_of_drive(self) -> slice:
-        """Cycles of the drive in the problem."""
-        state = self.optimum.state
-        return state.drives.parts(len(state.poses))[self.drive]
+            state = self.optimum.state
+            own = state.drives.parts(len(state.poses))[self.drive]
+            return (np.outer(weights, weights) * marginals)[own]
 
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Return the whole problem at the optimum by `nonlinear_graph`; lengths are divided by the scale."""
         return nonlinear_graph(self.system, self.optimum)
+
+    def pose_graph(self) -> gtsam.NonlinearFactorGraph:
+        """Return odometry and revisits by `graph.exchange:pose_graph`; lengths are divided by the scale."""
+        factors = drive_factors(self.system, self.optimum)  # no need for those of detections
+        return pose_graph(factors, self.system.chains[0].odometry, self.calibration)
+
+    @property
+    def own_factors(self) -> tuple[int, float]:
+        """Number of your own factors, and their share of `cost`."""
+        return len(self.system.own), self.optimum.own_cost
 
     def values(self) -> gtsam.Values:
         """Return the optimum divided by the scale: control points l_j and r_j, calibration b_0, poses x_k."""
@@ -138,42 +145,76 @@ class BatchMapper:
         self.odometry_sigma = odometry_sigma
         known_noise(odometry_sigma)  # check it early
 
+    def factors(self, log: Log) -> OwnFactors:
+        """Return factors of your own for a log at scale 1; none, unless a subclass has some."""
+        return ()
+
     def solve(
         self,
         log: Log,
         start: Start | None = None,
         on_round: Callable[[], None] | None = None,
-        factors: Sequence[gtsam.NonlinearFactor] = (),
+        factors: OwnFactors | None = None,
     ) -> BatchResult:
         """Search the optimum, from odometry alone or from an online map.
 
         `start` is by default `batch.start` of the settings. `on_round` is called after each round. `factors`
-        are GTSAM factors of your own on the poses of cycles (`graph.variables:pose_key`, `Pose2`) and on the
-        calibrations, as `BatchResult.values` has them. They are linearized at every step, and `graph` has
-        them. SettingsError for other keys, or if the start needs an online mapper and there is none;
-        SolveError if the log does not determine an optimum.
+        are GTSAM factors of your own, by default those of the method `factors`: on the poses of cycles
+        (`graph.variables:pose_key`, `Pose2`) and on the calibrations, as `BatchResult.values` has them.
+        Curves get new knots during the search, so factors on control points come from a function instead. It
+        is called with the present state whenever the curves are new, and `boundaries`, `control_points` and
+        `control_keys` of that are as those of a `FixedLagMapper`. Factors are linearized at every step, their
+        errors by GTSAM count in its cost, and `graph` has them. SettingsError for other keys or a factor that
+        depends on nothing, or if the start needs an online mapper and there is none; SolveError if the log
+        does not determine an optimum.
         """
         settings = self.settings.with_kind(log.sensor.kind)
-        calibrations = [CALIBRATION_KEY, *([SENSOR_KEY] if settings.calibration.sensor else [])]
-        known = np.append(calibrations, pose_keys(np.arange(len(log.cycles))))
-        expected = f"poses, x0 to x{len(log.cycles) - 1}, and of the calibrations"
-        check_keys(factors, known, expected)
-        return solved(partial(self._solve, settings, start, on_round, tuple(factors)), log)
+        factors = self.factors(log.at_scale_one()) if factors is None else factors
+        if not callable(factors):
+            factors = tuple(factors)
+            calibrations = [CALIBRATION_KEY, *([SENSOR_KEY] if settings.calibration.sensor else [])]
+            known = np.append(calibrations, pose_keys(np.arange(len(log.cycles))))
+            expected = f"poses, x0 to x{len(log.cycles) - 1}, and of the calibrations"
+            check_keys(factors, known, f"{expected}, as a function makes those on control points")
+        return solved(partial(self._solve, settings, start, on_round, factors), log)
 
     def _solve(
         self,
         settings: MapperSettings,
         start: Start | None,
         on_round: Callable[[], None] | None,
-        factors: Sequence[gtsam.NonlinearFactor],
+        factors: OwnFactors,
         log: Log,
     ) -> BatchResult:
+        """Judge the log, search the optimum from odometry or an online map, and simplify its curves."""
         watch, noise = Stopwatch(), known_noise(self.odometry_sigma)
-        judged = judge_log(log, noise, own_settings(settings))
+        start, judged = start or settings.batch.start, judge_log(log, noise, own_settings(settings))
         watch.lap("integrate")
-        start = start or settings.batch.start
-        optimizer = partial(_optimizer, judged, on_round, factors)
-        begun, online = self._search(log, judged, settings, noise, start, optimizer, watch)
+
+        def optimizer_with(revisits: Sequence[Revisit]) -> Optimizer:
+            """Make an optimizer with detections of its own, independent of other searches."""
+            detections = DetectionTable.of(judged.cycles, twists=judged.chain.twists)
+            system = BatchSystem(detections, [judged.chain], [judged.settings], revisits, own=factors)
+            return Optimizer(system, on_round=on_round)
+
+        begun, online = None, None
+        revisits = () if start == "online" else find_revisits(judged)
+        if start != "online":
+            begun = find_closed_optimum(optimizer_with(revisits))
+        if begun is None and start == "odometry":
+            begun = find_from_odometry(optimizer_with(()))
+        if begun is None:
+            if self.online is None:
+                raise SettingsError("start online: expected an online mapper, found none")
+            watch.lap("optimum")
+            mapper = self.online(settings, noise)
+            state, online = start_online(log, mapper, judged.settings)
+            watch.lap("start")
+            if start == "auto" and not revisits:
+                begun = find_closed_optimum(optimizer_with(mapper.closed_by))
+            if begun is None:
+                optimizer = optimizer_with(mapper.revisits)
+                begun = Found(optimizer, *optimizer.find(state))
         found, known = with_wider_priors(begun)
         watch.lap("optimum")
         solved_map = map_of(found, known, _orange(judged, found.at.state), watch)
@@ -187,51 +228,6 @@ class BatchMapper:
             online=online,
             seconds=watch.laps,
         )
-
-    def _search(
-        self,
-        log: Log,
-        judged: JudgedLog,
-        settings: MapperSettings,
-        noise: KnownNoise,
-        start: Start,
-        optimizer_with: Callable[[Sequence[Revisit]], Optimizer],
-        watch: Stopwatch,
-    ) -> tuple[Found, RunResult | None]:
-        """Return the optimum, and the online run in which the search began, if any."""
-        revisits: Sequence[Revisit] = ()
-        if start != "online":
-            revisits = find_revisits(judged)
-            found = find_closed_optimum(optimizer_with(revisits))
-            if found is None and start == "odometry":
-                found = find_from_odometry(optimizer_with(()))
-            if found is not None:
-                return found, None
-        if self.online is None:
-            raise SettingsError("start online: expected an online mapper, found none")
-        watch.lap("optimum")
-        mapper = self.online(settings, noise)
-        state, online = start_online(log, mapper, judged.settings)
-        watch.lap("start")
-        found = None
-        if start == "auto" and not revisits:
-            found = find_closed_optimum(optimizer_with(mapper.closed_by))
-        if found is None:
-            optimizer = optimizer_with(mapper.revisits)
-            found = Found(optimizer, *optimizer.find(state))
-        return found, online
-
-
-def _optimizer(
-    judged: JudgedLog,
-    on_round: Callable[[], None] | None,
-    factors: Sequence[gtsam.NonlinearFactor],
-    revisits: Sequence[Revisit],
-) -> Optimizer:
-    """Make an optimizer with a system and detections of its own, independent of other searches."""
-    detections = DetectionTable.of(judged.cycles, twists=judged.chain.twists)
-    system = BatchSystem(detections, judged.chain, judged.settings, revisits, own=factors)
-    return Optimizer(system, on_round=on_round)
 
 
 def find_from_odometry(optimizer: Optimizer) -> Found:
@@ -314,7 +310,10 @@ def result_of(
     parts = state.drives.parts(len(state.poses))
     poses, own = state.poses[parts[drive]].copy(), few.detections.of_drive(drive)
     records, laps = records_of(few, chain, sum(seconds.values()) / len(parts), drive)
-    vehicle = _vehicle_of(found, known, drive)
+    last, keys = parts[drive].stop - 1, state.calibration_keys(drive)
+    covariance = known.covariance(np.append(pose_key(last), keys))
+    size = found.system.settings.odometry.sigma_size
+    vehicle = vehicle_of(state.poses[last], state.variables.of(keys), covariance, size)
     return BatchResult(
         estimator=NAME,
         settings=settings,
@@ -348,14 +347,6 @@ def known_of(system: BatchSystem, at: Evaluation) -> FactoredSystem:
     return FactoredSystem(kept, cholesky(eliminated_system(system.linear_graph(at), kept)[0]))
 
 
-def _vehicle_of(found: Found, known: FactoredSystem, drive: int) -> VehicleState:
-    """Return the last pose of a drive and its calibration, with their joint covariance."""
-    state, size = found.at.state, found.system.settings.odometry.sigma_size
-    last, keys = state.drives.parts(len(state.poses))[drive].stop - 1, state.calibration_keys(drive)
-    covariance = known.covariance(np.append(pose_key(last), keys))
-    return vehicle_of(state.poses[last], state.variables.of(keys), covariance, size)
-
-
 def _map_of_curves(few: Simplified, joint: Array, settings: MapperSettings) -> Map:
     """Return the curves with their cones, and their covariance plus the scatter of the cones."""
     state, boundaries = few.state, {}
@@ -371,12 +362,8 @@ def _map_of_curves(few: Simplified, joint: Array, settings: MapperSettings) -> M
 
 
 def _orange(judged: JudgedLog, state: State) -> dict[int, PointBoundary]:
-    settings, twists = judged.settings, judged.chain.twists
-    seen = [
-        Sighting(k, state.poses[k], twists[k], detections)
-        for k, detections in enumerate(judged.orange)
-        if len(detections.labels)
-    ]
+    settings, seen = judged.settings, OrangeDetections.of(judged.orange, twists=judged.chain.twists)
+    seen.place(0, state.poses)
     return orange_cones(seen, state.variables.sensor, settings.growth, settings.spline.sigma_shape)
 
 
@@ -391,7 +378,7 @@ def records_of(
     offered = np.bincount(detections.cycle, minlength=part.stop)[part].tolist()
     poses, counter, share = state.poses[part], LapCounter(), seconds / len(chain)
     if drive > 0:  # count laps from the start of the drive
-        poses = compose(inverse(frame_of(chain, poses)), poses)
+        poses = compose(inverse(frame_of_drive(chain, poses)), poses)
     records = tuple(
         CycleRecord(k, t, share, left, right, used[k], counter.update(poses[k]), offered=offered[k])
         for k, t in enumerate(chain.stamps.tolist())
@@ -399,6 +386,6 @@ def records_of(
     return records, counter.completed
 
 
-def frame_of(chain: LogOdometry, poses: Array) -> Array:
+def frame_of_drive(chain: LogOdometry, poses: Array) -> Array:
     """Pose (3,) of the vehicle at the first stamp of a drive, given the poses (P, 3) of its cycles."""
     return compose(poses[0], inverse(chain.first))

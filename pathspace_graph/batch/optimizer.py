@@ -10,7 +10,7 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.front_end.log_odometry import half_square
-from pathspace_graph.graph.elimination import Damping, Elimination, linear_graph
+from pathspace_graph.graph.elimination import Damping, linear_graph, solution
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.labels import UNKNOWN
@@ -51,6 +51,17 @@ class Effort:
     tolerance: float = 1.0  # factor of the tolerance
 
 
+@dataclass(frozen=True)
+class Stage:
+    """Part of a search: what changes before it, and what ends it."""
+
+    gate: float  # gate of the first round (sigmas); it shrinks to `batch.gate`
+    rounds: int  # largest number of rounds
+    tolerance: float = 1.0  # factor of the tolerance
+    refit: bool = False  # whether curves are first fitted again through their cones
+    stations: bool = False  # whether detections are matched to the cones of closed curves
+
+
 class Optimizer:
     """Levenberg-Marquardt from a state to the minimum; `on_round` is called after each round."""
 
@@ -63,22 +74,26 @@ class Optimizer:
         self._last_step: Array | None = None  # last step of the map and the calibration
 
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
-        """Find the optimum on curves with about one knot for each cone, which meet the cones.
+        """Find the optimum on curves with about one knot for each cone, which meet the cones."""
+        first, *others = self.schedule(state)
+        at, convergence = self.run(self.align_poses(state, first.gate), first)
+        for stage in others:
+            at, convergence = self.run(at.state, stage)
+        return at, convergence
 
-        On closed curves, stations constrain the detections along them.
+    def schedule(self, state: State) -> list[Stage]:
+        """Stages of the search; on closed curves, stations constrain the detections along them.
+
+        The last stage matches again: more cones are unambiguous by then.
         """
-        detections, settings, rounds = self.system.detections, self.system.settings, self.effort.rounds
-        gate = self.settings.gate
+        gate, rounds, rough = self.settings.gate, self.effort.rounds, self.effort.tolerance * ROUGH_TOLERANCE
         first_gate = gate if self.system.revisits else LOOSE_GATE
-        state = self.align_poses(state, first_gate)
-        state = reknot(state, detections, settings, dense=True)
-        at, _ = self.run(state, first_gate, self.effort.rough_rounds, rough=True)
-        state = reknot(at.state, detections, settings, dense=True)
-        curves = [*state.boundaries.values()]
-        if not (settings.stations and curves and all(curve.periodic for curve in curves)):
-            return self.run(state, gate, rounds)
-        at, _ = self.run(state, gate, rounds, rough=True, stations=True)
-        return self.run(at.state, gate, rounds, stations=True)  # match again: more cones are unambiguous now
+        first = Stage(first_gate, self.effort.rough_rounds, rough, refit=True)
+        curves = state.boundaries.values()
+        if not (self.system.settings.stations and curves and all(curve.periodic for curve in curves)):
+            return [first, Stage(gate, rounds, self.effort.tolerance, refit=True)]
+        second = Stage(gate, rounds, rough, refit=True, stations=True)
+        return [first, second, Stage(gate, rounds, self.effort.tolerance, stations=True)]
 
     def align_poses(self, state: State, gate: float) -> State:
         """Take one Gauss-Newton step of the poses alone, with fixed map and calibration."""
@@ -87,20 +102,19 @@ class Optimizer:
         at, _ = self._refreshed(state, gate, False)
         return moved(state, self.system.poses_alone(at))
 
-    def run(
-        self, state: State, gate: float, rounds: int, rough: bool = False, stations: bool = False
-    ) -> tuple[Evaluation, Convergence]:
+    def run(self, state: State, stage: Stage) -> tuple[Evaluation, Convergence]:
         """Optimize in rounds until a step is short, and return the problem after it.
 
         Each round takes one step. The gate (sigmas) shrinks to that of the settings (graduated
         non-convexity), and the search ends only afterwards. When hardly any association changes, all of them
-        and the sigmas are fixed: between two near rows, some would change forever. A `rough` search has a
-        looser tolerance. With `stations`, cones of closed curves constrain the detections along them.
+        and the sigmas are fixed: between two near rows, some would change forever.
         """
-        system, tolerance = self.system, TOLERANCE_DECREASE * self.effort.tolerance
-        tolerance *= ROUGH_TOLERANCE if rough else 1.0
+        system, gate, rounds = self.system, stage.gate, stage.rounds
+        tolerance = TOLERANCE_DECREASE * stage.tolerance
+        if stage.refit:
+            state = reknot(state, system.detections, system.settings)
         locate_poses(state)
-        system.begin(state, stations)
+        system.begin(state, stage.stations)
         self._last_step, searching, converged, done = None, True, False, 0
         while not converged and done < rounds:
             done, gate = done + 1, max(gate, self.settings.gate)
@@ -118,7 +132,10 @@ class Optimizer:
             converged = not searching and decrease <= tolerance
             gate *= GATE_FACTOR
         reason = "nothing changes any more" if converged else "no round left"
-        decrease = decrease if converged else self._undamped_decrease(at)
+        if not converged:
+            rows, variables = system.rows(at), at.state.variables
+            undamped = solution(linear_graph(rows, variables), variables.layout)
+            decrease = predicted_decrease(rows, variables.layout, undamped)
         norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
         return at, Convergence(converged, reason, done, self.steps, at.cost, norm)
 
@@ -161,27 +178,21 @@ class Optimizer:
         self.damping.reset()
         return at, decrease
 
-    def _undamped_decrease(self, at: Evaluation) -> float:
-        problem = self.system.eliminated(at)
-        step = problem.step(np.zeros(problem.map.size))
-        return predicted_decrease(self.system.rows(at), at.state.variables.layout, step)
-
     def _trial(self, at: Evaluation, rows: Sequence[Rows]) -> tuple[Evaluation | None, float]:
         """Return the problem after a damped step, None if the cost has grown, and the predicted decrease."""
-        state, system = at.state, self.system
+        state, system, layout = at.state, self.system, at.state.variables.layout
         damped = [*rows, *system.damping(state, self.damping.weight)]
         try:
-            problem = Elimination(linear_graph(damped, state.variables), state.variables.layout)
-            step = problem.step(np.zeros(problem.map.size))
+            step = solution(linear_graph(damped, state.variables), layout)
         except SingularSystemError:
             return None, np.inf
         decrease = np.inf
         if self.damping.is_light:  # a strongly damped step is short without convergence
-            decrease = predicted_decrease(rows, state.variables.layout, step)
+            decrease = predicted_decrease(rows, layout, step)
         trial = system.evaluate(system.retract(state, step))
         if trial.cost > at.cost:
             return None, decrease
-        before, self._last_step = self._last_step, step[: problem.map.size]
+        before, self._last_step = self._last_step, step[: layout.size - state.poses.size]
         factor = 1.0 if before is None else extrapolation_factor(self._last_step, before)
         if factor == 1.0:
             return trial, decrease

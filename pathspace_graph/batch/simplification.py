@@ -14,72 +14,63 @@ from pathspace_graph.graph.variables import CONTROL_LETTERS, POINT, Layout
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import ExactSplineSettings, MapperSettings, SplineSettings
-from pathspace_graph.spline.boundary import Boundary, sampled
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import chosen_breaks, fewest_breaks, fit_spline, refit
+from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.bspline import BSpline, sparse_rows
+from pathspace_graph.spline.knots import (
+    ENERGY_WEIGHT,
+    LeastSquares,
+    chosen_breaks,
+    fewest_breaks,
+    fit_spline,
+)
 
 from .association import ROW_CONES, associate, cones_of_curve, feet_of_cones, locate_poses
 
 MIN_SIZE_SHARE: Final = 0.6  # least number of control points tried, relative to the largest
-ALIKE: Final = (3.0, 0.01)  # parameters on curves of length L through the same cones differ by < a + b L (m)
 NEED_STEP: Final = 1.0  # distance of the points of a line's curve that determine its number of knots (m)
 MOST_NEEDED: Final = 400  # largest number of these points; bounds the time
 FOLDS: Final = 4  # groups of the cross-validation, interleaved so that the neighbours of a cone remain
 
 
-def reknot(state: State, detections: DetectionTable, settings: MapperSettings, dense: bool = False) -> State:
-    """Fit every curve of a state again, through the cones along it.
-
-    `dense` places enough knots for the curves to meet the cones; otherwise there are as few as in the map.
-    """
+def reknot(state: State, detections: DetectionTable, settings: MapperSettings) -> State:
+    """Fit every curve of a state again, on knots enough to meet the cones along it."""
     state = state.copy()
     for label, boundary in list(state.boundaries.items()):
-        cones = cones_of_curve(state, detections, label, settings)
-        points = cones.points
+        points = cones_of_curve(state, detections, label, settings).points
         if len(points) < ROW_CONES:
             continue
-        if not dense and settings.of_lines:
-            spline = fit_line(state.spline(label), settings)
-            state.replace_boundary(label, *boundary_of(spline, settings))
-            continue
-        if not dense:  # use the optimum's curve beside the cones, some of which are outliers
-            points = feet_of_cones(state, cones, label).position
-        share, least_share = settings.batch.size_share, MIN_SIZE_SHARE
-        if dense:
-            share, least_share = settings.batch.dense_share, 1.0
-            if not boundary.periodic:
-                points = extended(points, settings.growth.merge_radius)
-        spline = fit_through(points, boundary.periodic, settings, share, least_share)
+        if not boundary.periodic:
+            points = extended(points, settings.growth.merge_radius)
+        spline, _ = fit_through(points, boundary.periodic, settings, settings.batch.dense_share, 1.0)
         state.replace_boundary(label, *boundary_of(spline, settings))
     return state
 
 
 def fit_through(
     points: Array, periodic: bool, settings: MapperSettings, share: float, least_share: float = MIN_SIZE_SHARE
-) -> BSpline:
+) -> tuple[BSpline, Array]:
     """Fit the best curve through ordered cones (k, 2), with at most `share` control points for each.
 
     It has at least the share `least_share` of that number. A closed curve begins at the cone nearest to the
-    start, so that similar cones give similar knots.
+    start, so that similar cones give similar knots. The second result are the cones' parameters (k,).
     """
     smallest, degree = settings.spline.min_size, settings.spline.degree
     most = max(smallest, int(share * len(points)))
-    if periodic:
-        points = np.roll(points, -int(np.hypot(*points.T).argmin()), axis=0)
+    first = int(np.hypot(*points.T).argmin()) if periodic else 0
+    points = np.roll(points, -first, axis=0)
     chosen = chosen_breaks(points, periodic, degree, max(smallest, int(least_share * most)), most)
-    return fit_spline(points, chosen.size, periodic, degree, chosen.breaks)
+    spline, u = fit_spline(points, chosen.breaks, periodic, degree)
+    return spline, np.roll(u, first)
 
 
-def fit_line(spline: BSpline, settings: MapperSettings) -> BSpline:
-    """Fit the curve on fewest knots that follows a line's curve within half of `spline.sigma_shape`.
+def fit_line(points: Array, periodic: bool, settings: SplineSettings) -> tuple[BSpline, Array]:
+    """Fit the curve on fewest knots that follows points (k, 2) of a line within half of `sigma_shape`.
 
     This increases the standard deviation by an eighth. A line has no cones to determine its number of knots.
+    The second result are the points' parameters (k,).
     """
-    own, smallest = settings.spline, settings.spline.min_size
-    step = max(NEED_STEP, spline.length() / MOST_NEEDED)
-    points = sampled(spline, step)[: -1 if spline.periodic else None]
-    chosen = fewest_breaks(points, spline.periodic, own.degree, smallest, 0.5 * own.sigma_shape)
-    return fit_spline(points, chosen.size, spline.periodic, own.degree, chosen.breaks)
+    chosen = fewest_breaks(points, periodic, settings.degree, settings.min_size, 0.5 * settings.sigma_shape)
+    return fit_spline(points, chosen.breaks, periodic, settings.degree)
 
 
 def extended(points: Array, beyond: float) -> Array:
@@ -184,7 +175,7 @@ def cross_validated(points: Array, periodic: bool, settings: MapperSettings, sha
         out = (number % FOLDS == fold) & ~ends
         if (~out).sum() < ROW_CONES:
             continue
-        spline = fit_through(points[~out], periodic, settings, share)
+        spline, _ = fit_through(points[~out], periodic, settings, share)
         low, high = (np.full(out.sum(), end) for end in spline.domain)
         step = settings.spline.search_step
         foot = foot_points(spline.tables, spline.control_points, points[out], low, high, step)
@@ -213,43 +204,36 @@ class Simplified:
 def simplified(state: State, detections: DetectionTable, settings: MapperSettings) -> Simplified:
     """Return the same poses with curves on few knots (paper: Simplification).
 
-    `C_new = F C_old`, so the covariance is `F Sigma F'`. The optimum itself is not solved on few knots: such
-    a curve misses its cones by a decimetre, on the same side in every lap, which rotates vehicle and map by
-    up to a degree in the first seconds. The detections are associated with the new curves.
+    The fit is linear in the points that it follows, and so in the old control points: `C_new = F C_old`, and
+    the covariance is `F Sigma F'`. The points are those of the old curve beside the cones, some of which are
+    outliers. The optimum itself is not solved on few knots: such a curve misses its cones by a decimetre, on
+    the same side in every lap, which rotates vehicle and map by up to a degree in the first seconds. The
+    detections are associated with the new curves.
     """
-    few = reknot(state, detections, settings)
-    change = np.zeros((few.map_points.size, state.map_points.size))
+    few, changes = state.copy(), {}
     for label, boundary in state.boundaries.items():
-        new, new_points = few.boundaries[label], few.control_points(label)
-        F = new_from_old(boundary, state.control_points(label), new, new_points)
+        old, periodic, changes[label] = state.spline(label), boundary.periodic, np.eye(boundary.size)
+        cones = cones_of_curve(state, detections, label, settings)
+        if len(cones.points) < ROW_CONES:
+            continue
+        if settings.of_lines:
+            step = max(NEED_STEP, old.length() / MOST_NEEDED)
+            u = np.linspace(*old.domain, max(int(boundary.length / step), 1) + 1)[: -1 if periodic else None]
+            new, w = fit_line(old.evaluate(u), periodic, settings.spline)
+        else:
+            u = feet_of_cones(state, cones, label).u
+            new, w = fit_through(old.evaluate(u), periodic, settings, settings.batch.size_share)
+        replaced, points = boundary_of(new, settings)
+        fit = LeastSquares(replaced.spline(points), w, ENERGY_WEIGHT)
+        changes[label] = fit.solve(sparse_rows(*old.local_basis(u), old.size))
+        few.replace_boundary(label, replaced, points)
+    change = np.zeros((few.map_points.size, state.map_points.size))
+    for label, F in changes.items():
         change[map_block(few, label), map_block(state, label)] = np.kron(F, np.eye(POINT))
     detections = detections.copy()
     locate_poses(few)
     associate(few, detections, settings, settings.batch.gate, strict=True)
     return Simplified(few, change, detections, scatter_about(few, detections, settings))
-
-
-def new_from_old(old: Boundary, old_points: Array, new: Boundary, new_points: Array) -> Array:
-    """Fit F (m_new, m_old) by least squares over points of the old curve and their feet on the new one."""
-    splines = old.spline(old_points), new.spline(new_points)
-    if new.periodic:
-
-        def nearest_on_new(u: Array) -> Array:
-            return new.find_anywhere(new_points, old.evaluate(old_points, u)).u
-
-        return refit(*splines, nearest_on_new).new_from_old
-    # an open curve that passes the same cones again lies on itself: search near the same parameter
-    ends, quarter = np.array([new.tables.low, new.tables.high]), 0.25 * (old.tables.high - old.tables.low)
-    low = np.array([old.tables.low, old.tables.high - quarter])
-    first, last = old.find(old_points, new.evaluate(new_points, ends), low, low + quarter).u.tolist()
-    room = ALIKE[0] + ALIKE[1] * (ends[1] - ends[0])
-
-    def foot_on_new(u: Array) -> Array:
-        alike = ends[0] + (u - first) * (ends[1] - ends[0]) / (last - first)
-        low, high = (np.clip(alike + side * room, *ends) for side in (-1.0, 1.0))
-        return new.find(new_points, old.evaluate(old_points, u), low, high).u
-
-    return refit(*splines, foot_on_new, (first, last)).new_from_old
 
 
 def map_block(state: State, label: int) -> slice:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, Protocol
 
+import gtsam
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array
@@ -16,7 +17,7 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import difference, path_lengths, relative, rotated, to_map
 from pathspace_graph.front_end.front_end import JudgedLog
 from pathspace_graph.front_end.log_odometry import LogOdometry
-from pathspace_graph.graph.elimination import Elimination, linear_graph
+from pathspace_graph.graph.elimination import Elimination, linear_graph, solution
 from pathspace_graph.graph.rows import Revisit, revisit_rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, pose_keys
 from pathspace_graph.io.log import Log
@@ -25,10 +26,8 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
 from pathspace_graph.mapping.state import State
-from pathspace_graph.places.constellation import Prior
 from pathspace_graph.places.passes import (
     NEARBY,
-    SeenIn,
     find_return,
     return_to_beginning,
     revisit_of,
@@ -117,7 +116,7 @@ def start_odometry(system: BatchSystem) -> State:
     The curves are closed if there is a revisit: the first one ends a lap.
     """
     detections, settings, revisits = system.detections, system.settings, system.revisits
-    aligned, state = aligned_odometry(system.chain, revisits), State()
+    aligned, state = aligned_odometry(system.chains[0], revisits), State()
     calibration = np.array(settings.calibrations)
     calibration[:CALIBRATION_SIZE] = aligned.calibration
     detections.correct(calibration[CALIBRATION_SIZE:])
@@ -155,12 +154,12 @@ class AlignedOdometry:
     @cached_property
     def covariances(self) -> Array:
         """Marginal covariance (P, 3, 3) of each pose."""
-        return self.system().pose_marginals
+        return Elimination(self.linear_graph(), self.variables.layout).pose_marginals
 
-    def system(self) -> Elimination:
+    def linear_graph(self) -> gtsam.GaussianFactorGraph:
         """Linearize the problem at the present values."""
         rows = self.chain.rows(self.poses, self.calibration) + revisit_rows(self.revisits, self.poses)
-        return Elimination(linear_graph(rows, self.variables), self.variables.layout)
+        return linear_graph(rows, self.variables)
 
     def disagreement(self, poses: Array) -> float:
         """Root mean square distance of poses (P, 3) from these, in standard deviations."""
@@ -181,20 +180,25 @@ def aligned_odometry(
         variables = begin.variables.copy()
     aligned = AlignedOdometry(chain, revisits, variables)
     for _ in range(ALIGN_STEPS):
-        step = aligned.system().step(np.zeros(CALIBRATION_SIZE))
+        step = solution(aligned.linear_graph(), variables.layout)
         variables.values = variables.values + step
         if np.abs(step).max() < ALIGN_TOLERANCE:
             break
     return aligned
 
 
-def all_cones(judged: JudgedLog) -> DetectionColumns:
-    """Detections of all cones of a log, corrected by the known calibration of the sensor."""
+def all_detections(judged: JudgedLog) -> DetectionColumns:
+    """Detections of a whole log, of orange cones too, corrected by the known calibration of the sensor."""
     pairs = zip(judged.cycles, judged.orange, strict=True)
     table = DetectionColumns.of([one.with_others(other) for one, other in pairs], twists=judged.chain.twists)
     calibration = judged.settings.calibration
     table.correct(np.array(calibration.means) if calibration.sensor else np.zeros(0))
-    return table.cones(judged.settings.of_lines)
+    return table
+
+
+def all_cones(judged: JudgedLog) -> DetectionColumns:
+    """Those of `all_detections` that are of cones."""
+    return all_detections(judged).cones(judged.settings.of_lines)
 
 
 def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
@@ -214,7 +218,9 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
         so_far = poses[: newest + 1]
         if revisits:
             due = driven[newest] + REVISIT_INTERVAL / 3.0
-            revisit = _return_again(seen, so_far, lap, settings)
+            last = float(path_lengths(so_far)[-1]) - LAP_SHARE * lap
+            found = find_return(seen, so_far, last, settings)
+            revisit = None if found is None else revisit_of(found[0], so_far, found[1], newest)
         else:
             due = driven[newest] + closing.check_interval
             revisit = return_to_beginning(seen, so_far, reckoned.covariances[newest], settings)
@@ -223,24 +229,12 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
         if not revisits:
             lap = length_of_lap(reckoned.poses, revisit)
         revisits.append(revisit)
-        if _is_off(revisit, poses):
+        off = difference(relative(poses[revisit.earlier], poses[revisit.later]), revisit.local)
+        if float(np.square(off / NEARBY[0]).sum()) > OFF**2:
             aligned = aligned_odometry(chain, revisits, aligned)
             poses = aligned.poses
         due = driven[newest] + REVISIT_INTERVAL
     return tuple(revisits)
-
-
-def _is_off(revisit: Revisit, poses: Array) -> bool:
-    """Whether poses (P, 3) contradict a revisit too much for the search of the next one."""
-    off = difference(relative(poses[revisit.earlier], poses[revisit.later]), revisit.local)
-    return float(np.square(off / NEARBY[0]).sum()) > OFF**2
-
-
-def _return_again(seen: SeenIn, poses: Array, lap: float, settings: MapperSettings) -> Revisit | None:
-    """Return the newest of poses (P, 3) in the frame of one a lap (m) before, after laps were aligned."""
-    last = float(path_lengths(poses)[-1]) - LAP_SHARE * lap
-    found = find_return(seen, poses, last, Prior.about(poses[-1], *NEARBY), settings)
-    return None if found is None else revisit_of(found[0], poses, found[1], len(poses) - 1)
 
 
 def _begin_boundary(
@@ -273,5 +267,5 @@ def _begin_boundary(
     covariances = rotated(detections.covariance[rows[kept]], poses[cycles[kept], 2])
     cones = cluster(points[kept], station[kept], covariances, length, closes, settings)
     if len(cones.u) >= ROW_CONES:
-        spline = fit_through(cones.points, closes, settings, settings.batch.size_share)
+        spline, _ = fit_through(cones.points, closes, settings, settings.batch.size_share)
         state.add_boundary(label, *boundary_of(spline, settings))

@@ -1,32 +1,39 @@
-"""The least-squares problem of a whole log: its cost at a state, and its linearization."""
+"""The least-squares problem of one or several whole logs: its cost at a state, and its linearization."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import gtsam
 import numpy as np
+from scipy.spatial import KDTree
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.factors.linear import keys_of_factor
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
-from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners
+from pathspace_graph.factors.sensor import SENSOR_SIZE
+from pathspace_graph.front_end.log_odometry import LogOdometry, half_square, sensor_prior
+from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners, solution
 from pathspace_graph.graph.rows import Revisit, Rows, at_values, by_widths, revisit_rows
-from pathspace_graph.graph.variables import POINT, Layout, are_poses, pose_keys
-from pathspace_graph.graph.window import rows_on_poses
+from pathspace_graph.graph.variables import POINT, Layout, are_poses, of_sensor, pose_keys
+from pathspace_graph.graph.window import check_keys, check_linear, user_rows
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.detection_rows import NO_ROWS, DetectionRows, rows_across
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.state import GivenFactor, State
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .association import StationMatches, headings, match_stations
+from .association import DIRECTION_PENALTY, StationMatches, headings, match_stations, nearest_by
 
 LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
 SETTLE_FEET: Final = 16  # largest number of refinements of the foot points before a step
 SETTLED_FOOT: Final = 1e-3  # largest move of a converged foot point (m along the curve)
 SIGMA_SLIDE: Final = 2.0  # standard deviation of a control point's slide along a curve with stations (m)
+
+OwnFactors = Sequence[gtsam.NonlinearFactor] | Callable[[State], Sequence[gtsam.NonlinearFactor]]
+"""The user's factors in a batch: those on control points are made of its present curves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +94,7 @@ def curve_gauge(state: State, label: int, sigma: float, until: int | None = None
     control_points, cycle = state.control_points(label), _nearest_poses(state, label, until)
     beside = state.poses[cycle]
     ahead = (headings(beside) * (control_points - beside[:, :2])).sum(axis=1)
-    return CurveGauge(label, state.keys(label), cycle, ahead, sigma)
+    return CurveGauge(label, state.control_keys(label), cycle, ahead, sigma)
 
 
 def _nearest_poses(state: State, label: int, until: int | None) -> IntArray:
@@ -97,17 +104,17 @@ def _nearest_poses(state: State, label: int, until: int | None) -> IntArray:
     points of the nearest parameter.
     """
     boundary, points, poses = state.boundaries[label], state.control_points(label), state.poses[:until]
-    u = boundary.abscissae
+    u, pose_u, heads = boundary.abscissae, state.pose_u[label][:until], headings(poses)
     position, tangent = (boundary.evaluate(points, u, order) for order in (0, 1))
-    dx, dy = position[:, :1] - poses[:, 0], position[:, 1:] - poses[:, 1]
-    along = tangent[:, :1] * np.cos(poses[:, 2]) + tangent[:, 1:] * np.sin(poses[:, 2])
-    square = dx**2 + dy**2
-    square[along <= 0.0] += square.max(initial=0.0)
-    if not boundary.periodic:
-        away = np.abs(u[:, None] - state.pose_u[label][:until])
-        room = float(np.mean(boundary.nominal))
-        square[away > away.min(axis=1, keepdims=True) + room] = np.inf
-    return np.asarray(square.argmin(axis=1))
+    away, _ = map(np.asarray, KDTree(pose_u[:, None]).query(u[:, None]))
+    room = away + (np.inf if boundary.periodic else float(np.mean(boundary.nominal)))
+
+    def unfit(i: IntArray, j: IntArray) -> Array:
+        """Penalty (m^2) of poses j that drive against the curve beside control points i, or elsewhere."""
+        against = np.where((tangent[i] * heads[j]).sum(axis=-1) <= 0.0, DIRECTION_PENALTY**2, 0.0)
+        return np.where(np.abs(u[i] - pose_u[j]) > room[i], np.inf, against)
+
+    return nearest_by(position, poses[:, :2], unfit)
 
 
 @dataclass(frozen=True)
@@ -139,29 +146,34 @@ class Evaluation:
     across: DetectionRows  # used detections across the curves; infinite sigma beyond an end
     u: Array  # (m,) parameters of their foot points (m)
     along: DetectionRows  # used detections at their stations
-    drive: list[Rows]  # rows of odometry, priors and revisits
-    cost: float  # half the sum of squares, with the robust losses of the detections
+    drive: list[Rows]  # rows of odometry, priors, revisits, and of the user's factors
+    cost: float  # half the sum of squares, with the robust losses of the detections and of the user's factors
+    own_cost: float  # share of the user's factors
 
 
 class BatchSystem:
-    """Problem of minimizing `sum rho(detections) + 1/2 |odometry, revisits, gauge, priors|^2`."""
+    """Problem of minimizing `sum rho(detections) + 1/2 |odometry, revisits, gauge, priors|^2`.
+
+    Cycles are numbered consecutively over all drives, without odometry from one drive to the next. Each drive
+    has its own calibration; drives of one vehicle share the sensor's.
+    """
 
     def __init__(
         self,
         detections: DetectionTable,
-        chain: LogOdometry,
-        settings: MapperSettings,
+        chains: Sequence[LogOdometry],
+        priors: Sequence[MapperSettings],
         revisits: Sequence[Revisit] = (),
-        factors: Sequence[Rows] = (),
-        own: Sequence[gtsam.NonlinearFactor] = (),
+        given: Sequence[GivenFactor] = (),
+        own: OwnFactors = (),
     ) -> None:
         self.detections = detections
-        self.chain = chain
-        self.settings = settings
-        self.priors = [settings]  # settings of each drive, for the priors of its calibrations
+        self.chains = [*chains]  # odometry of each drive
+        self.priors = [*priors]  # settings of each drive, for the priors of its calibrations
         self.revisits = tuple(revisits)  # relative poses of cycles on the same road
-        self.factors = by_widths(factors)  # the user's factors, at values of zero
-        self.own = tuple(own)  # the user's factors on poses and calibrations, linearized at every step
+        self.own: tuple[gtsam.NonlinearFactor, ...] = ()  # the user's factors, linearized at every step
+        self._own, self._given = own, given
+        self._given_rows: list[Rows] = []  # the user's factors of an online drive, at values of zero
         self.kernel = Biweight(LOOSE_GATE)
         self.gauges: dict[int, CurveGauge] = {}  # of each boundary
         self.matches: StationMatches | None = None  # stations of closed curves, if they are used
@@ -169,14 +181,20 @@ class BatchSystem:
 
     def widen_priors(self, drive: int, settings: MapperSettings) -> None:
         """Take the priors of a drive's calibrations from other settings."""
-        self.settings = self.priors[drive] = settings
-        self.chain = replace(self.chain, calibration_sigma=np.array(settings.odometry.sigmas))
+        sigma = np.array(settings.odometry.sigmas)
+        self.priors[drive] = settings
+        self.chains[drive] = replace(self.chains[drive], calibration_sigma=sigma)
 
     def begin(self, state: State, stations: bool = False) -> None:
-        """Rebuild the gauges at the present control points, after knots have changed.
+        """Rebuild the gauges and the user's factors on the present control points, after knots have changed.
 
-        With `stations`, the used detections are matched to the cones of closed curves.
+        With `stations`, the used detections are matched to the cones of closed curves. SettingsError for a
+        user's factor that cannot be used.
         """
+        self.own, variables = tuple(self._own(state) if callable(self._own) else self._own), state.variables
+        check_keys(self.own, variables.keys, "poses, control points and calibrations of the batch")
+        check_linear(self.own, lambda one: variables.gtsam_values(keys_of_factor(one)), constant=False)
+        self._given_rows = by_widths([rows for one in self._given for rows in one.on(state)])
         self.matches = match_stations(state, self.detections, self.settings) if stations else None
         self.gauges = {label: curve_gauge(state, label, self.sigma_slide) for label in state.boundaries}
 
@@ -185,9 +203,26 @@ class BatchSystem:
         """Standard deviation of a control point's slide along its curve (m)."""
         return SIGMA_SLIDE if self.matches else self.settings.batch.sigma_slide
 
+    @property
+    def settings(self) -> MapperSettings:
+        """Settings of the problem, those of the first drive."""
+        return self.priors[0]
+
     def drive_rows(self, state: State) -> list[Rows]:
-        """Rows of odometry, and of the priors of the first pose and the calibrations."""
-        return self.chain.rows_at(state.variables, self.settings.calibration)
+        """Rows of odometry and calibrations of each drive; only the first has a prior of its first pose."""
+        groups, variables, sensors = list[Rows](), state.variables, state.drives.sensors
+        calibrations = variables.calibration.reshape(-1, CALIBRATION_SIZE)
+        for d, part in enumerate(state.drives.parts(len(state.poses))):
+            chain, poses, calibration = self.chains[d], state.poses[part], calibrations[d]
+            if d == 0:
+                groups += chain.rows(poses, calibration)
+                continue
+            own = [chain.odometry_rows(poses, calibration), *chain.calibration_priors(calibration)]
+            groups += [in_drive(rows, d, part.start) for rows in own]
+        for number in range(len(variables.sensor) // SENSOR_SIZE):  # each by its first drive
+            prior = self.priors[sensors.index(number)].calibration
+            groups.append(sensor_prior(of_sensor(variables.sensor, number), prior, number))
+        return groups
 
     def evaluate(self, state: State, hold: bool = False) -> Evaluation:
         """Evaluate the problem at a state; foot points are refined from the parameters of the detections.
@@ -196,15 +231,19 @@ class BatchSystem:
         derivative.
         """
         drive = self.drive_rows(state) + revisit_rows(self.revisits, state.poses)
-        own = by_widths(rows_on_poses(self.own, state.variables) or ())
-        drive += [at_values(rows, state.variables) for rows in (*self.factors, *own)]
+        drive += [at_values(rows, state.variables) for rows in self._given_rows]
         across, u = self._across(state, hold) if state.boundaries else (NO_ROWS, np.zeros(0))
         along = self._along(state, self.matches) if self.matches else NO_ROWS
         unused = len(self.detections) - int(np.isfinite(across.sigma).sum())
         cost = half_square(drive) + unused * self.kernel.gate**2 / 6.0  # the loss of one at the gate
         cost += sum(float(self.kernel.loss(seen.whitened).sum()) for seen in (across, along))
         cost += half_square(self._priors(state, self.gauges))
-        return Evaluation(state, across, u, along, drive, cost)
+        own_rows, own_cost = by_widths(user_rows(self.own, state.variables)), 0.0
+        if self.own:
+            values = state.variables.gtsam_values(state.variables.keys)
+            own_cost = sum(factor.error(values) for factor in self.own)
+        drive += [at_values(rows, state.variables) for rows in own_rows]
+        return Evaluation(state, across, u, along, drive, cost + own_cost, own_cost)
 
     def _across(self, state: State, hold: bool) -> tuple[DetectionRows, Array]:
         """Linearize used detections across the curves; return them and the foot points' parameters (m,).
@@ -283,11 +322,11 @@ class BatchSystem:
         after, poses, goal = linear.copy(), state.poses, linear.poses
         for part in state.drives.parts(len(poses)):
             own, aim = poses[part], goal[part]
-            driven = seen_from(own[1:, :2], own[:-1], aim[1:, :2], aim[:-1])
+            driven = seen_after_step(own[1:, :2], own[:-1], aim[1:, :2], aim[:-1])
             after.poses[part][1:, :2] = aim[0, :2] + np.cumsum(turned(driven, aim[:-1, 2]), axis=0)
         for label, gauge in self.gauges.items():
             points, k = after.control_points(label), gauge.cycle
-            seen = seen_from(state.control_points(label), poses[k], points, goal[k])
+            seen = seen_after_step(state.control_points(label), poses[k], points, goal[k])
             points[:] = to_map(seen, after.poses[k])
         return after
 
@@ -295,10 +334,16 @@ class BatchSystem:
         """Step (3 P,) of the poses with fixed map and calibration."""
         keys = at.state.variables.keys
         graph = linear_graph(fix_map(self.rows(at)), at.state.variables)
-        return Elimination(graph, Layout(keys[are_poses(keys)])).poses_given(np.zeros(0))
+        return solution(graph, Layout(keys[are_poses(keys)]))
 
 
-def seen_from(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
+def in_drive(rows: Rows, number: int, first_cycle: int) -> Rows:
+    """Renumber rows of a drive alone, by its number and first cycle among several drives."""
+    keys = rows.keys + np.where(are_poses(rows.keys), first_cycle, number)
+    return replace(rows, keys=keys, owner=rows.owner + owners(np.array(first_cycle)))
+
+
+def seen_after_step(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
     """Transform points (m, 2), map frame, to the frames of poses (m, 3) after a step, to first order."""
     arm, change = points - poses[:, :2], points_after - points - poses_after[:, :2] + poses[:, :2]
     turn = (poses_after[:, 2] - poses[:, 2])[:, None]

@@ -32,7 +32,6 @@ from .simulate import describe, generated_track
 
 RIVAL: Final = "landmark-fixed-lag"  # estimator whose table stands beside the spline graph's in the demo
 PICTURE: Final = "track.png"
-PICTURE_DPI: Final = 150.0  # resolution of the picture, dots per inch, which suits a web page
 APART_FILE: Final = "apart.json"  # by which the folder is recognized
 STATISTICS: Final = ("mean", "rms", "p95", "max")
 
@@ -72,7 +71,8 @@ def compare_maps(first: Path, second: Path, out: Path, *, force: bool) -> Outcom
     check_target(out, APART_FILE, force=force)
     tracks = read_map(first), read_map(second)
     apart = maps_apart(*tracks)
-    content = {"maps": [str(first), str(second)], **apart.to_json()}
+    distances = {"motion": apart.motion, "distances": apart.statistics()}
+    content = {"maps": [str(first), str(second)], **distances}
     with atomic_folder(out, APART_FILE, force=force) as folder:
         write_json(folder / APART_FILE, content)
         save_plot(plot_apart(*tracks, apart), folder / "apart.png")
@@ -103,7 +103,7 @@ def demo_command(options: Demo) -> Outcome:
         write_log(log, folder / "log")
         write_result(folder / "map", result, summarize(result, log))
         picture = plot_map(result.map, log=log, trajectory=result.trajectory, smoothed=result.smoothed)
-        save_plot(picture, folder / PICTURE, PICTURE_DPI)
+        save_plot(picture, folder / PICTURE, 150.0)  # dots per inch, which suits a web page
     table = side_by_side({run.estimator: laps_of(run, log) for run in (result, rival)})
     if len(table.frame):
         output().print(table.rich())

@@ -9,7 +9,7 @@ import numpy as np
 
 from pathspace_graph.console import progress, say
 from pathspace_graph.convert.bag import read_bag
-from pathspace_graph.convert.recording import Recording, rate, to_log, windowed
+from pathspace_graph.convert.recording import rate, to_log, windowed
 from pathspace_graph.convert.settings import LabelRule
 from pathspace_graph.convert.text_files import read_csv, read_json_lines
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError
@@ -41,7 +41,11 @@ OF_KIND: Final = {  # kinds of records that take an option; any other option is 
 
 
 def convert_command(options: Convert) -> Outcome:
-    _check_kind(options)
+    for name, kinds in OF_KIND.items():
+        given: Any = options if hasattr(options, name) else options.topics
+        if options.kind not in kinds and getattr(given, name) != getattr(type(given), name):
+            expected = f"expected --from {' or '.join(kinds)}"
+            raise SettingsError(f"--{name.replace('_', '-')}: {expected}, found {options.kind}")
     records = _records(options)
     if not records:
         _convert(options, options.source, options.out)
@@ -58,15 +62,6 @@ def convert_command(options: Convert) -> Outcome:
         some = f"{len(refused)} of {len(records)} records were refused"
         raise PathspaceError(f"{some}: {'; '.join(refused)}")
     return Outcome(written)
-
-
-def _check_kind(options: Convert) -> None:
-    """Raise a SettingsError for an option that the kind of the record would ignore."""
-    for name, kinds in OF_KIND.items():
-        given: Any = options if hasattr(options, name) else options.topics
-        if options.kind not in kinds and getattr(given, name) != getattr(type(given), name):
-            expected = f"expected --from {' or '.join(kinds)}"
-            raise SettingsError(f"--{name.replace('_', '-')}: {expected}, found {options.kind}")
 
 
 def _records(options: Convert) -> list[Path]:
@@ -86,20 +81,18 @@ def _convert(options: Convert, source: Path, out: Path) -> None:
     check_target(out, LOG_FILE, force=options.force)
     rule = LabelRule(options.labels, options.label_field)
     with progress("converting"):
-        record = windowed(_read(options, source, rule), options.window, source)
+        if options.kind == "csv":
+            read = read_csv(source, options.topics, rule, options.columns, options.units)
+        elif options.kind == "jsonl":
+            read = read_json_lines(source, options.topics, rule)
+        else:
+            read = read_bag(source, options.topics, rule, mounted=options.frames.mounting is not None)
+        record = windowed(read, options.window, source)
         recorded = to_log(record, options.frames, options.noise, source, options.window.spacing)
         log = with_measured_noise(replace(recorded, scale=options.scale), record.parts)
         write_checked(log, out, source, force=options.force)
     tell_log(record.notes, rule, log)
     tell(hints(log))
-
-
-def _read(options: Convert, source: Path, rule: LabelRule) -> Recording:
-    if options.kind == "csv":
-        return read_csv(source, options.topics, rule, options.columns, options.units)
-    if options.kind == "jsonl":
-        return read_json_lines(source, options.topics, rule)
-    return read_bag(source, options.topics, rule, mounted=options.frames.mounting is not None)
 
 
 def with_measured_noise(log: Log, parts: int = 1) -> Log:

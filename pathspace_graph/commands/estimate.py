@@ -1,9 +1,10 @@
 """`online` and `batch`: map a log cycle by cycle, without reading ahead, or optimize it at once."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from importlib import import_module
 from itertools import count
 from pathlib import Path
@@ -14,20 +15,20 @@ from rich.table import Table
 from rich.text import Text
 
 from pathspace_graph import estimators
-from pathspace_graph.batch.joint import JointResult, solve_together
+from pathspace_graph.batch.joint import solve_together
 from pathspace_graph.batch.known_map import map_of_cones
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.eval.metrics import summary
-from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.eval.metrics.alignment import MapDifference, differences
 from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import inverse
+from pathspace_graph.graph.exchange import GRAPH_FILE, write_graph
 from pathspace_graph.health import DEGRADED, LOST, counts
-from pathspace_graph.io.files import check_target
+from pathspace_graph.io.files import atomic_file, check_target
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map, as_ribbon, read_map
 from pathspace_graph.io.overrides import override
@@ -77,18 +78,34 @@ def read_known_map(path: Path, sigma: float, settings: MapperSettings) -> KnownT
 
 
 def online_command(options: Online) -> Outcome:
-    check_online_options(options)
+    estimators.check_online(options.estimator)
+    check_target(options.out, MAP_FILE, force=options.force)
+    if options.on is not None and options.estimator != DEFAULT_ONLINE:
+        raise SettingsError(f"--on: expected --estimator {DEFAULT_ONLINE}, found {options.estimator}")
+    for name, is_given in (("start", options.start is not None), ("keep-map", options.keep_map)):
+        if is_given and options.on is None:
+            raise SettingsError(f"--{name}: expected --on MAP as well, found none")
     parameters = own_parameters(options)
     known = None if options.on is None else read_known_map(options.on, options.map_sigma, options.settings)
-    if options.plot is not None:
-        plotting().check_picture(options.plot)
-    viewing = None
+    drawing = viewing = None
+    if options.plot is not None:  # importing matplotlib is slow
+        drawing = import_module("pathspace_graph.commands.plot")
+        drawing.check_picture(options.plot)
     if options.view or options.save_view is not None:
         viewing = import_module("pathspace_graph.eval.view.recording")
         viewing.check_recording(options.save_view, options.view)
     log, hints = read_plausible_log(options.log, options.settings.limits, options.scale)
     tell(hints)
-    log, estimator = begin(options, known, log, parameters)
+    estimator: OnlineEstimator
+    if known is None:
+        estimator = estimators.make_online(options.estimator, options.settings, log, parameters)
+    else:
+        settings, start = estimators.settings_of(options.settings, log), known.start
+        start = start if options.start is None else np.array(options.start)
+        start = None if start is None else start / np.array([log.scale, log.scale, 1.0])
+        track = scaled(known.map, 1.0 / log.scale)
+        estimator = FixedLagMapper.on(track, settings, log.noise, start=start, keep=options.keep_map)
+        log = replace(log, truth=None)  # it is in another frame
     with (
         nullcontext()
         if viewing is None
@@ -109,8 +126,8 @@ def online_command(options: Online) -> Outcome:
             summarized["known_map"] = {"map": str(options.on), "found_at": found_at}
             summarized["differences"] = [asdict(one) for one in changes]
         write_result(options.out, result, summarized, force=options.force)
-    if options.plot is not None:
-        plotting().plot_command(Plot(map=options.out, out=options.plot, log=None if known else options.log))
+    if drawing is not None and options.plot is not None:
+        drawing.plot_command(Plot(map=options.out, out=options.plot, log=None if known else options.log))
     report(result, log)
     say(*(one.line for one in changes))
     crossed = crossings_told(crossings_of(result))
@@ -119,22 +136,6 @@ def online_command(options: Online) -> Outcome:
         wrong.append(f"the vehicle was not found on {options.on}: this is the map of its own road")
     files = (options.out, options.plot, options.save_view)
     return Outcome([file for file in files if file is not None], summarized, wrong)
-
-
-def plotting() -> Any:
-    """Import the module that draws maps; importing matplotlib is slow."""
-    return import_module("pathspace_graph.commands.plot")
-
-
-def check_online_options(options: Online) -> None:
-    """Raise an error where options contradict each other, before anything is mapped."""
-    estimators.check_online(options.estimator)
-    check_target(options.out, MAP_FILE, force=options.force)
-    if options.on is not None and options.estimator != DEFAULT_ONLINE:
-        raise SettingsError(f"--on: expected --estimator {DEFAULT_ONLINE}, found {options.estimator}")
-    for name, is_given in (("start", options.start is not None), ("keep-map", options.keep_map)):
-        if is_given and options.on is None:
-            raise SettingsError(f"--{name}: expected --on MAP as well, found none")
 
 
 def own_parameters(options: Online | Batch) -> Any:
@@ -148,26 +149,17 @@ def own_parameters(options: Online | Batch) -> Any:
     return parameters
 
 
-def begin(
-    options: Online, known: KnownTrack | None, log: Log, parameters: Any
-) -> tuple[Log, OnlineEstimator]:
-    """Make an estimator on a known map or on none; and the log, without its truth where that is elsewhere."""
-    if known is None:
-        return log, estimators.make_online(options.estimator, options.settings, log, parameters)
-    settings = estimators.settings_of(options.settings, log)
-    start = known.start if options.start is None else np.array(options.start)
-    start = None if start is None else start / np.array([log.scale, log.scale, 1.0])
-    track = scaled(known.map, 1.0 / log.scale)
-    mapper = FixedLagMapper.on(track, settings, log.noise, start=start, keep=options.keep_map)
-    return replace(log, truth=None), mapper  # the truth is in another frame
-
-
 def batch_command(options: Batch) -> Outcome:
     estimators.check_batch(options.estimator)
-    if options.start == "odometry" and options.estimator != DEFAULT_BATCH:
+    maker = estimators.maker_of(options.estimator)
+    is_ours = isinstance(maker, type) and issubclass(maker, BatchMapper)
+    is_ours |= options.estimator == DEFAULT_BATCH
+    if options.start == "odometry" and not is_ours:
         raise SettingsError(f"--start: expected online for {options.estimator}, found {options.start}")
     check_target(options.out, MAP_FILE, force=options.force)
     parameters = own_parameters(options)
+    if options.graph and (not is_ours or len(options.log) > 1):
+        raise SettingsError(f"--graph: expected one log and the estimator {DEFAULT_BATCH}")
     if len(options.log) > 1:
         return batch_of_several(options)
     log, hints = read_plausible_log(options.log[0], options.settings.limits, options.scale)
@@ -179,6 +171,9 @@ def batch_command(options: Batch) -> Outcome:
         result: BatchRun = of_kind(solved, options.map, options.settings)
     summarized = summarize_batch(result, log, hints)
     write_result(options.out, result, summarized, force=options.force)
+    if options.graph and isinstance(solved, BatchResult):
+        with atomic_file(options.out / GRAPH_FILE) as temporary:
+            write_graph(temporary, solved.graph(), solved.values(), solved.pose_graph())
     report(result, log)
     return Outcome([options.out], summarized, objections(hints) + untrusted(result))
 
@@ -192,11 +187,18 @@ def batch_of_several(options: Batch) -> Outcome:
     for name, folder in unique_names(options.log).items():
         logs[name], hints[name] = read_plausible_log(folder, options.settings.limits, options.scale)
         tell(hints[name], of=name)
+    make: Any = partial(estimators.make_batch, DEFAULT_BATCH)
     with progress("optimizing") as advance:
-        joint = solve_together(logs, spline_batch, options.settings, options.start, advance)
+        joint = solve_together(logs, make, options.settings, options.start, advance)
     name, result = next(iter(joint.drives.items()))
     result = of_kind(result, options.map, options.settings)
-    summarized = summarize_batch(result, logs[name], hints[name]) | summary_of_drives(joint, logs)
+    drives = dict[str, Any]()
+    shown = ("lap_count", "noise", "calibration", "final", "ate", "inside_two_sigma")
+    for own, drive in joint.drives.items():  # with truth in the frame of each drive
+        known = summarize(drive.moved(inverse(joint.frames[own])), logs[own])
+        drives[own] = {"frame": joint.frames[own], **{key: known[key] for key in shown if key in known}}
+    summarized = summarize_batch(result, logs[name], hints[name])
+    summarized |= {"drives": drives, "left_out": joint.left_out}
     write_result(options.out, result, summarized, joint.drives, force=options.force)
     report(result, logs[name])
     for name, drive in joint.drives.items():
@@ -206,12 +208,6 @@ def batch_of_several(options: Batch) -> Outcome:
     left_out = [f"{name} is left out: {why}" for name, why in joint.left_out.items()]
     wrong = [f"{of}: {line}" for of in logs for line in objections(hints[of])]
     return Outcome([options.out], summarized, [*left_out, *wrong, *untrusted(result)])
-
-
-def spline_batch(settings: MapperSettings, log: Log) -> BatchMapper:
-    estimator = estimators.make_batch(DEFAULT_BATCH, settings, log)
-    assert isinstance(estimator, BatchMapper)
-    return estimator
 
 
 def untrusted(result: BatchRun) -> list[str]:
@@ -232,16 +228,6 @@ def unique_names(folders: Sequence[Path]) -> dict[str, Path]:
         same = (f"{name}-{number}" for number in count(2))
         named[name if name not in named else next(one for one in same if one not in named)] = folder
     return named
-
-
-def summary_of_drives(joint: JointResult, logs: Mapping[str, Log]) -> dict[str, Any]:
-    """What is known of each drive of a joint map, with truth in the drive's own frame."""
-    drives = dict[str, Any]()
-    shown = ("lap_count", "noise", "calibration", "final", "ate", "inside_two_sigma")
-    for name, result in joint.drives.items():
-        own = summarize(result.moved(inverse(joint.frames[name])), logs[name])
-        drives[name] = {"frame": joint.frames[name], **{key: own[key] for key in shown if key in own}}
-    return {"drives": drives, "left_out": joint.left_out}
 
 
 def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
@@ -295,7 +281,12 @@ def map_online(
 def report(result: RunResult, log: Log) -> None:
     """Print the run, the paper's table where there is truth, and on standard error what was not mapped."""
     if laps := laps_of(result, log):
-        output().print(laps_table(laps))
+        table = Table()
+        for name in ("lap", "rmse [m]", "missed [%]", "size"):
+            table.add_column(Text(name), justify="right")  # a plain text would be markup, [m] a style
+        for row in laps:
+            table.add_row(str(row.lap), f"{row.rmse:.3f}", f"{100 * row.missed:.1f}", str(row.size))
+        output().print(table)
     begin = float(log.odometry.t[0])  # a bag's stamps count from 1970
     say(outline(result, begin))
     if result.scale != 1.0:
@@ -322,31 +313,15 @@ def outline(result: RunResult, begin: float = 0.0) -> str:
     orange = sorted(result.map.points.items())
     cones = [f"{own.size} {NAMES[label].replace('_', ' ')} cones" for label, own in orange]
     size = [] if result.scale == 1.0 else [f"{result.scale:g} times the size of a Formula Student track"]
-    return ", ".join([laps, loop, points, *cones, *size, *health_outline(result, begin)])
-
-
-def health_outline(result: RunResult, begin: float) -> list[str]:
-    """Share of cycles that were not good, and why the vehicle is lost at the end."""
     number = counts([summary.health_of(record) for record in result.cycles])
-    total = max(len(result.cycles), 1)
     reasons = Counter(record.reason for record in result.cycles if record.health == DEGRADED)
     mostly = f" (mostly: {reasons.most_common(1)[0][0]})" if reasons else ""
-    parts = [
-        f"{condition} in {number[condition] / total:.1%} of the cycles".replace("%", " %") + why
+    health = [
+        f"{condition} in {100.0 * (number[condition] / max(len(result.cycles), 1)):.1f} % of the cycles{why}"
         for condition, why in ((DEGRADED, mostly), (LOST, ""))
         if number[condition]
     ]
     last = summary.stretches_of(result)[-1:]
     if last and last[0].health == LOST and last[0].end == result.cycles[-1].t:
-        parts.append(f"still lost since {last[0].begin - begin:.1f} s ({last[0].reason})")
-    return parts
-
-
-def laps_table(laps: list[LapMetrics]) -> Table:
-    """The paper's Table 1 with a row for each lap."""
-    table = Table()
-    for name in ("lap", "rmse [m]", "missed [%]", "size"):
-        table.add_column(Text(name), justify="right")  # a plain text would be markup, in which [m] is a style
-    for row in laps:
-        table.add_row(str(row.lap), f"{row.rmse:.3f}", f"{100 * row.missed:.1f}", str(row.size))
-    return table
+        health.append(f"still lost since {last[0].begin - begin:.1f} s ({last[0].reason})")
+    return ", ".join([laps, loop, points, *cones, *size, *health])

@@ -2,11 +2,13 @@
 
 import shutil
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
+from pathspace_graph.console import note
 from pathspace_graph.errors import InputError, SettingsError
-from pathspace_graph.health import LOST
+from pathspace_graph.graph.exchange import GRAPH_FILE, read_graph, write_g2o
 from pathspace_graph.io import export as formats
 from pathspace_graph.io.export import LocalPlane
 from pathspace_graph.io.files import atomic_file, check_file_target
@@ -16,10 +18,13 @@ from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FILE, write_trajectory
 from pathspace_graph.io.tables import read_table, read_trajectory
 from pathspace_graph.options.runs import Export
-from pathspace_graph.spline.ahead import LEAST_STEP, MOST_POINTS
-from pathspace_graph.spline.boundary import crossed_boundaries, crossings_told
+from pathspace_graph.plausibility.diagnosis import crossings_on
+from pathspace_graph.spline.boundary import crossings_told
+from pathspace_graph.spline.planning import LEAST_STEP, MOST_POINTS
 
 from .outcome import Outcome
+
+GRAPHS: Final = ("graph", "g2o", "dot")  # formats of a factor graph
 
 
 def export_command(options: Export) -> Outcome:
@@ -33,9 +38,15 @@ def export_command(options: Export) -> Outcome:
         expected = "expected LATITUDE LONGITUDE HEADING in degrees, the heading clockwise from north"
         raise SettingsError(f"--origin: {expected}, found none, which --as {options.format} needs")
     plane = None if options.origin is None else LocalPlane(*options.origin)
+    if options.format in GRAPHS:
+        return export_graph(options.map / GRAPH_FILE, options.format, options.out)
     file = options.map / MAP_FILE
     if options.format == "tum" and not file.exists() and (options.map / LOG_FILE).exists():
-        write_true_path(options.map, options.out)
+        truth = read_log(options.map).truth
+        if truth is None or len(truth.poses) == 0:
+            raise InputError(options.map, f"expected a log with {TRUTH_POSES_FILE}, or a map, found neither")
+        with atomic_file(options.out) as temporary:
+            write_trajectory(temporary, truth.pose_t, truth.poses)
         return Outcome([options.out])
     track = read_map(options.map)
     most = MOST_POINTS * options.step
@@ -44,7 +55,12 @@ def export_command(options: Export) -> Outcome:
             expected = f"expected curves of at most {most:g} m at this step"
             raise InputError(file, f"{expected}, found {length:.6g} m")
     if options.format not in ("points", "tum"):  # the others say where to drive
-        check_crossings(track, options.map)
+        files = (options.map / name for name in (SMOOTHED_FILE, TRAJECTORY_FILE))
+        for driven in [file for file in files if file.exists()][:1]:
+            path, cycles = read_trajectory(driven)[1], options.map / CYCLES_FILE
+            health = [*read_table(cycles).columns.get("health", ())] if cycles.exists() else []
+            if crossed := crossings_told(crossings_on(track, path, health)):
+                raise InputError(file, f"expected the map of the drive in {driven.name}: {crossed}")
     with atomic_file(options.out) as temporary:
         try:
             _write(options, temporary, track, plane)
@@ -57,7 +73,8 @@ def _write(options: Export, file: Path, track: Map, plane: LocalPlane | None) ->
     if options.format == "centerline":
         formats.write_centre_line(file, track, options.step)
     elif options.format == "profile":
-        formats.write_profile(file, track, options.step, options.speed, options.start_speed, options.stop)
+        begin, stop = options.start_speed, options.stop
+        formats.write_profile(file, track, options.step, options.speed, begin, stop)
     elif options.format == "points":
         formats.write_points(file, track, options.step)
     elif options.format == "tum":
@@ -68,25 +85,22 @@ def _write(options: Export, file: Path, track: Map, plane: LocalPlane | None) ->
         write(file, track, options.step, plane)
 
 
-def write_true_path(folder: Path, out: Path) -> None:
-    """Write the true poses of a log in the TUM format; InputError where they are not known."""
-    truth = read_log(folder).truth
-    if truth is None or len(truth.poses) == 0:
-        raise InputError(folder, f"expected a log with {TRUTH_POSES_FILE}, or a map, found neither")
+def export_graph(file: Path, form: str, out: Path) -> Outcome:
+    """Write the factor graph of a batch for GTSAM, Graphviz or g2o; InputError where there is none."""
+    if not file.exists():
+        raise InputError(file, "expected a factor graph, which batch --graph writes, found none")
+    try:
+        graph, values = read_graph(file, "pose_graph" if form == "g2o" else "graph")
+    except (KeyError, RuntimeError, ValueError) as error:
+        raise InputError(file, f"expected a factor graph of batch --graph, found {error!r}") from error
     with atomic_file(out) as temporary:
-        write_trajectory(temporary, truth.pose_t, truth.poses)
-
-
-def check_crossings(track: Map, folder: Path) -> None:
-    """Raise an InputError where the vehicle drove across a boundary, if its trajectory is in the folder."""
-    files = (folder / name for name in (SMOOTHED_FILE, TRAJECTORY_FILE))
-    file = next((file for file in files if file.exists()), None)
-    if file is None:
-        return
-    path, cycles = read_trajectory(file)[1][:, :2], folder / CYCLES_FILE
-    health = read_table(cycles, {}).columns.get("health", ()) if cycles.exists() else ()
-    lost = np.array([condition == LOST for condition in health], bool)
-    known = ~lost if len(lost) == len(path) else None
-    crossed = crossings_told(crossed_boundaries(track.splines, path, known))
-    if crossed:
-        raise InputError(folder / MAP_FILE, f"expected the map of the drive in {file.name}: {crossed}")
+        if form == "graph":
+            shutil.copyfile(file, temporary)
+        elif form == "dot":
+            temporary.write_text(graph.dot(values), encoding="utf-8")
+        else:
+            write_g2o(temporary, graph, values)
+    if form == "g2o":
+        left_out = read_graph(file)[0].size() - graph.size()
+        note(f"g2o holds poses and what relates two of them: {left_out} other factors are left out")
+    return Outcome([out])

@@ -18,21 +18,19 @@ from .outcome import Outcome
 
 def simulate_command(options: Simulate) -> Outcome:
     check_target(options.out, LOG_FILE, force=options.force)
+    if [options.track, options.generate, options.event].count(None) != 2:
+        raise SettingsError("simulate: expected one of --track FILE, --generate SEED or --event NAME")
     with progress("driving"):
-        log = simulate(_track(options), options.settings, options.seed)
+        if options.track is not None:
+            track = read_track(options.track)
+        elif options.generate is not None:
+            track = generated_track(options.generate, options.generator)
+        else:
+            track = EVENTS[str(options.event)]()
+        log = simulate(track, options.settings, options.seed)
         write_log(log, options.out, force=options.force)
     say(describe(log))
     return Outcome([options.out])
-
-
-def _track(options: Simulate) -> Track:
-    if [options.track, options.generate, options.event].count(None) != 2:
-        raise SettingsError("simulate: expected one of --track FILE, --generate SEED or --event NAME")
-    if options.track is not None:
-        return read_track(options.track)
-    if options.generate is not None:
-        return generated_track(options.generate, options.generator)
-    return EVENTS[str(options.event)]()
 
 
 def generated_track(seed: int, settings: TrackGeneratorSettings | None = None) -> Track:

@@ -12,7 +12,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import ONLINE, check_online
 from pathspace_graph.eval import benchmark
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
-from pathspace_graph.eval.experiment.run import check_jobs, make_plan, of_other_code, run_plan, unfinished
+from pathspace_graph.eval.experiment.run import check_jobs, make_plan, of_other_code, run_study, unfinished
 from pathspace_graph.eval.experiment.study import Study, find_study, log_folders, read_study_file
 from pathspace_graph.eval.experiment.tables import write_study
 from pathspace_graph.eval.report import ReportPlan, write_report
@@ -34,7 +34,7 @@ def execute(
         note(f"{stale} runs in {options.out} are of other code, and are not used")
     with progress("runs", lines=LINES) as advance:
         how: dict[str, Any] = {"cluster": options.cluster, "retry_failed": options.retry_failed}
-        frame = run_plan(plan, options.out, jobs=options.jobs, on_cell=advance, **how)
+        frame = run_study(plan, options.out, jobs=options.jobs, on_cell=advance, **how)
     text = write(study, frame, options.out)
     say(text.rstrip("\n"), "")
     failures = frame[frame["failure"] != ""]["failure"].tolist()
@@ -74,16 +74,12 @@ def scale_command(options: Scale) -> Outcome:
         raise SettingsError("--quick: expected no other --scaling options with it, found some")
     check_target(options.out, benchmark.MARKER, force=options.force)
     measured = benchmark.QUICK if options.quick else options.scaling
-    with progress("simulating"):
-        drives = benchmark.make_drives(measured)
-    cycles = sum(sweep.cycles for sweep in drives.values())
     with unfinished(options.out) as folder:
-        with progress("timing", cycles, lines=LINES) as advance:
-            scaling = benchmark.measure_scaling(names, drives, measured, options.settings, folder, advance)
-        benchmark.write_scaling(options.out, scaling, force=options.force)
-    table = benchmark.scaling_table(scaling)
+        with progress("sweeps", lines=LINES) as advance:
+            points = benchmark.measure_scaling(names, measured, options.settings, folder, on_cell=advance)
+        benchmark.write_scaling(options.out, points, measured, options.settings, force=options.force)
+    table = benchmark.scaling_table(points, measured)
     output(wide=True).print(table.rich())
-    say(*benchmark.stops(scaling))
     return Outcome([options.out], {"slopes": table.records()})
 
 

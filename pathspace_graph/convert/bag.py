@@ -25,10 +25,8 @@ SUPPORTED: Final = {  # contents that a message must have, by the option of its 
     "--odometry": "a twist, a speed or a pose",
     "--imu": "an angular velocity",
     "--detections": "a point cloud, a scan, an array of markers, or a list of cones or polylines",
-    "transforms": "transforms",
 }
 STATIC: Final = "/tf_static"  # topic of the transforms between frames that are fixed to the vehicle
-LEVEL: Final = 0.98  # least cosine of a level sensor's z axis and the vehicle's
 
 
 class Samples(NamedTuple):
@@ -131,7 +129,8 @@ def _mounting(
     if not body or not others:
         return None
     place = transform_between(static, body, others[0]) if len(others) == 1 else None
-    if place is not None and place.rotation().matrix()[2, 2] > LEVEL:
+    # the sensor is level: the cosine of its z axis and the vehicle's
+    if place is not None and place.rotation().matrix()[2, 2] > 0.98:
         x, y, yaw = place.x(), place.y(), place.rotation().yaw()
         told = f"which {STATIC} puts at {x:.3g} {y:.3g} {yaw:.3g} (m, m, rad) in {body}"
         notes[f"messages with detections are in frame {others[0]}, {told}"] += len(detections.values)
@@ -183,7 +182,9 @@ class Bag:
             self._reader = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
             self._reader.open()
         except Exception as error:
-            found = f"found {described(path)} ({error}); {READABLE}"
+            bags = "bags of ROS 1 and ROS 2 (.bag, .db3, and .mcap of profile 'ros2')"
+            readable = f"read are {bags}, CSV (--from csv) and JSON lines (--from jsonl)"
+            found = f"found {described(path)} ({error}); {readable}"
             raise InputError(path, f"expected a ROS bag, {found}") from None
 
     def close(self) -> None:
@@ -309,10 +310,6 @@ KINDS: Final = {  # kind of a file, by its first bytes
     b"ULog": "a ULog of PX4",
     b"": "a file of another kind",
 }
-READABLE: Final = (
-    "read are bags of ROS 1 and ROS 2 (.bag, .db3, and .mcap of profile 'ros2'), CSV (--from csv) and "
-    "JSON lines (--from jsonl)"
-)
 
 
 def described(path: Path) -> str:

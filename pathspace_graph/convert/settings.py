@@ -4,9 +4,10 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from colorsys import rgb_to_hsv
+from contextlib import suppress
 from dataclasses import dataclass
-from math import inf, isfinite, pi
-from typing import Annotated, Any, Final, Literal
+from math import inf, pi
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,17 +15,13 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import SIGMA_DETECTIONS
 from pathspace_graph.labels import BIG_ORANGE, LEFT, NAMES, ORANGE, RIGHT, UNKNOWN
-from pathspace_graph.settings.checked import AT_LEAST_0, POSITIVE, AtLeast0, Checked, Signed, Unlimited
+from pathspace_graph.settings.checked import AtLeast0, Checked, Positive, Signed, Unlimited
 
 Side = Literal["left", "right"]  # side of the x axis to which the y axis points
 # fields of a message that may hold the label of a detection, the first one that is there
 LABEL_FIELDS: Final = ("label", "class", "class_id", "color", "colour", "type", "results", "hypothesis")
 NO_LABEL: Final = "none"  # name of a label field that means no labels
 LEAST_SPACING: Final = 1e-3  # of points along a line (m)
-SIDE_WORDS: Final = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
-ORANGE_WORDS: Final = {"orange", "o"}
-BIG_WORDS: Final = {"big", "large"}
-HUES: Final = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)}  # in degrees
 
 
 @dataclass(frozen=True)
@@ -60,17 +57,17 @@ class Topics:
 class NoiseSettings(Checked, group=""):
     """Noise of a record that does not state it."""
 
-    sigma_odometry: Annotated[tuple[float, float, float] | None, POSITIVE] = None
+    sigma_odometry: tuple[Positive, Positive, Positive] | None = None
     """Each sample of [vx, vy, wz] has these standard deviations (m/s, m/s, rad/s), white from sample to
     sample. Without them they are 0.25, 0.12 and 0.035, or what a data set states of itself. The covariance in
     a message is not used: mostly it is that of a filter's state, which is not white."""
-    sigma_drift: Annotated[tuple[float, float, float] | None, AT_LEAST_0] = None
+    sigma_drift: tuple[AtLeast0, AtLeast0, AtLeast0] | None = None
     """Drift of the odometry beside that white noise (m, m and rad by root of s): a random walk of the
     integrated pose. Where it is not stated, 0.05, 0.05 and 0.0017 are assumed."""
     sigma_range: float | None = None
     """Standard deviation of the range at range 0 (m) of a detection without a covariance. Where none of these
     three is stated, they are measured, and without enough cones 0.05, 0.012 and 0.0157."""
-    sigma_range_growth: Annotated[float | None, AT_LEAST_0] = None
+    sigma_range_growth: AtLeast0 | None = None
     """Growth of the standard deviation of the range with the range (m/m)."""
     sigma_bearing: float | None = None
     """Standard deviation of the bearing (rad) of a detection without a covariance."""
@@ -98,7 +95,7 @@ class NoiseSettings(Checked, group=""):
 class Frames(Checked, group=""):
     """Frames in which odometry and detections were recorded."""
 
-    mounting: Annotated[tuple[float, float, float] | None, "a number"] = None
+    mounting: tuple[Signed, Signed, Signed] | None = None
     """Pose X Y YAW (m, m, rad) of the sensor in the vehicle frame: x forward, y left, yaw counterclockwise.
     Without it that of a bag's /tf_static is used, where there is one."""
     y: Side = "left"
@@ -172,7 +169,9 @@ class LabelRule:
             r, g, b = (float(channel) for channel in (value.r, value.g, value.b))
             text, label = f"colour ({r:.3g}, {g:.3g}, {b:.3g})", label_of_colour(r, g, b)
         else:
-            text = _whole(str(value).strip())
+            text = str(value).strip()
+            with suppress(ValueError):  # a whole number is `1`, also where it is written as `1.0`
+                text = str(int(float(text))) if float(text).is_integer() else text
             label = self._labels[text] if text in self._labels else label_of_words(text)
         self.met[text, label] += times
         return label
@@ -188,21 +187,13 @@ class LabelRule:
         return f"labels: {', '.join(values)}{', ...' * (len(self.met) > len(most))}" if values else ""
 
 
-def _whole(text: str) -> str:
-    """Text of a whole number as `1`, also where it is written as `1.0`; else the text."""
-    try:
-        number = float(text)
-    except ValueError:
-        return text
-    return str(int(number)) if isfinite(number) and number == int(number) else text
-
-
 def label_of_words(text: str) -> int:
     """Label of a text by its words, as blue and cone in `Blue-cone`; UNKNOWN where none or several tell."""
     words = {*re.findall(r"[a-z]+", text.lower())}
-    if words & ORANGE_WORDS:
-        return BIG_ORANGE if words & BIG_WORDS else ORANGE
-    sides = [label for label, names in SIDE_WORDS.items() if words & names]
+    if words & {"orange", "o"}:
+        return BIG_ORANGE if words & {"big", "large"} else ORANGE
+    of_side = {LEFT: {"blue", "left", "b"}, RIGHT: {"yellow", "right", "y"}}
+    sides = [label for label, names in of_side.items() if words & names]
     return sides[0] if len(sides) == 1 else UNKNOWN
 
 
@@ -211,6 +202,7 @@ def label_of_colour(red: float, green: float, blue: float) -> int:
     most, least = max(red, green, blue), min(red, green, blue)
     if not 0.0 < most < inf or not most - least > 0.3 * most:  # it is grey
         return UNKNOWN
-    hue = 360.0 * rgb_to_hsv(red, green, blue)[0]
-    labels = [label for label, (low, high) in HUES.items() if low <= hue <= high]
+    hue = 360.0 * rgb_to_hsv(red, green, blue)[0]  # degrees
+    hues = {LEFT: (190.0, 265.0), ORANGE: (14.0, 44.0), RIGHT: (44.0, 75.0)}
+    labels = [label for label, (low, high) in hues.items() if low <= hue <= high]
     return labels[-1] if labels else UNKNOWN  # yellow begins where orange ends

@@ -1,7 +1,7 @@
 """Text files: CSV with columns of any names and units, and JSON lines."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import pi
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,8 +34,6 @@ QUANTITIES: Final = {  # columns of each file and their quantities; a covariance
     },
 }
 COVARIANCE: Final = ("xx", "xy", "yy")  # columns of the covariance of a detection, if there is one
-QUATERNION: Final = ("qx", "qy", "qz", "qw")  # columns of a rotation, in place of a yaw
-OTHER_NAMES: Final = {"x": "tx", "y": "ty", "yaw": "theta"}  # columns of a pose, by the usual ones
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {  # units of each quantity, in SI units
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "length": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3},
@@ -117,7 +115,8 @@ class _Columns:
             self._fail("expected a header with the names of the columns")
         if not len(self.table):
             raise InputError(file, "expected at least one row, found a header only", 2)
-        self.stated, found = {*named}, {k: v for k, v in OTHER_NAMES.items() if v in self.table.columns}
+        other = {"x": "tx", "y": "ty", "yaw": "theta"}  # columns of a pose, by the usual ones
+        self.stated, found = {*named}, {k: v for k, v in other.items() if v in self.table.columns}
         self.named = found | {key: key for key in QUANTITIES[kind] if key in self.table.columns} | named
 
     def __contains__(self, key: str) -> bool:
@@ -168,8 +167,8 @@ def _motion(file: _Columns, *, from_poses: bool) -> tuple[Array, bool]:
     twists, poses = None, None
     if file.has("x", "y", "yaw"):
         poses = np.column_stack([file[key] for key in ("x", "y", "yaw")])
-    elif file.has("x", "y", *QUATERNION):
-        turn = SimpleNamespace(**{key[1]: file[key] for key in QUATERNION})
+    elif file.has("x", "y", "qx", "qy", "qz", "qw"):
+        turn = SimpleNamespace(**{axis: file[f"q{axis}"] for axis in "xyzw"})
         poses = np.column_stack([file["x"], file["y"], yaw_of(turn)])
     elif from_poses:
         file.require("x", "y", "yaw", otherwise=" for --from-poses")
@@ -226,7 +225,12 @@ def read_json_lines(file: Path, topics: Topics, rule: LabelRule) -> Recording:
             for name, found in moved.items():
                 if hasattr(entry, name):
                     found.append((row, stamp, np.array(getattr(entry, name), dtype=float).reshape(3)))
-            points = [*_points_of_line(entry, rule)]
+            lists = [name for name in ("detections", "polylines") if hasattr(entry, name)]
+            # each list is read as a message, and so is a scan
+            points = [cone_points(SimpleNamespace(**{name: getattr(entry, name)}), rule) for name in lists]
+            if hasattr(entry, "scan"):
+                limits = {"range_min": 0.0, "range_max": np.inf}
+                points.append(scan_points(SimpleNamespace(**{**limits, **vars(entry.scan)})))
         except BROKEN as error:
             expected = "expected a line with t, and with twist [vx, vy, wz], detections, polylines or a scan"
             told = f"found {shown(line)} ({type(error).__name__}: {error})"
@@ -248,12 +252,3 @@ def read_json_lines(file: Path, topics: Topics, rule: LabelRule) -> Recording:
         rows=np.array([row for row, _, _ in entries], int),
         place=f"{file.name}, line",
     )
-
-
-def _points_of_line(entry: SimpleNamespace, rule: LabelRule) -> Iterator[Points]:
-    """Yield the points of a line's lists and of its scan, each read as a message."""
-    for name in ("detections", "polylines"):
-        if hasattr(entry, name):
-            yield cone_points(SimpleNamespace(**{name: getattr(entry, name)}), rule)
-    if hasattr(entry, "scan"):
-        yield scan_points(SimpleNamespace(**{"range_min": 0.0, "range_max": np.inf, **vars(entry.scan)}))

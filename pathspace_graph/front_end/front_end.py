@@ -70,35 +70,16 @@ class FrontEnd(Copyable):
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Check the readings of a cycle: the twists since the previous one, and its detections."""
-        noise, check = self.noise, self._motion
+        noise, check, sides = self.noise, self._motion, self._sides
         cones, orange, in_lane = split_detections(detections, self._settings)
         checked = noise.for_check(cones, odometry.twist[-1] if len(odometry.t) else np.zeros(3))
-        motion = check.update(odometry, checked, noise.is_settled)
-        cones, notices = self._labelled(cones, checked, motion, in_lane=in_lane)
-        for_map, orange_for_map = noise.for_map(cones), noise.for_map(orange)
-        measured = self._measured(odometry, cones, motion)
-        doubted, notice = self._sensor_doubted, "; ".join(notices)
-        stated = cones, orange
-        return Reading(
-            motion, for_map, check.seen_again, orange_for_map, stated, noise, doubted, measured, notice
-        )
-
-    def _labelled(
-        self, cones: Detections, checked: Detections, motion: MeasuredMotion, *, in_lane: bool
-    ) -> tuple[Detections, list[str]]:
-        """Label cones by their sides, and return notices if the meaning of the colours changes."""
-        sides = self._sides
+        motion = check.update(odometry, checked, "contradict" if noise.is_settled else "agree")
         swapped, colourless = sides.swapped, sides.colourless
-        labels = sides.update(self._motion.pose, motion.twists, checked, in_lane=in_lane).labels
+        labels = sides.update(check.pose, motion.twists, checked, in_lane=in_lane).labels
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
-        return replace(cones, labels=labels), notices
-
-    def _measured(
-        self, odometry: Odometry, cones: Detections, motion: MeasuredMotion
-    ) -> MapperSettings | None:
-        """Measure noise and errors of the sensor; return settings with new priors of the calibrations."""
-        noise, check = self.noise, self._motion
+        cones = replace(cones, labels=labels)
+        for_map, orange_for_map = noise.for_map(cones), noise.for_map(orange)
         settings, calibration = self._settings, self._settings.calibration
         # measured noise includes measured errors of the sensor, and `calibrated` checks its prior with them
         may_doubt = not (self._sensor_doubted or noise.of_detections)
@@ -110,7 +91,17 @@ class FrontEnd(Copyable):
             check.set_noise(noise.twist)
         if fresh or not self._begun:
             settings, self._begun = noise.calibrated(self._settings), True
-        return None if settings is self._settings else settings
+        return Reading(
+            motion=motion,
+            detections=for_map,
+            seen_again=check.seen_again,
+            orange=orange_for_map,
+            stated=(cones, orange),
+            noise=noise,
+            sensor_doubted=self._sensor_doubted,
+            measured=None if settings is self._settings else settings,
+            notice="; ".join(notices),
+        )
 
     @property
     def noise_used(self) -> RunNoise:
@@ -151,20 +142,14 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
 def split_detections(detections: Detections, settings: MapperSettings) -> tuple[Detections, Detections, bool]:
     """Split detections into those of boundaries, points of lines merged, and orange cones.
 
-    The third value is `is_in_orange_lane`.
+    The third value is whether the nearest cones are orange: the vehicle drives to the track, or is at a gate.
     """
     of_orange = is_orange(detections)
-    cones = detections.where(~of_orange)
-    cones = merged(cones) if settings.of_lines else cones
-    return cones, detections.where(of_orange), is_in_orange_lane(detections, of_orange)
-
-
-def is_in_orange_lane(detections: Detections, of_orange: BoolArray) -> bool:
-    """Whether the nearest cones are orange: the vehicle drives to the track, or is at a gate."""
-    if of_orange.sum() < NEAREST:
-        return False
-    nearest = np.argsort(np.hypot(*detections.points_vehicle.T), kind="stable")[:NEAREST]
-    return bool(of_orange[nearest].all())
+    cones, in_lane = detections.where(~of_orange), False
+    if of_orange.sum() >= NEAREST:
+        nearest = np.argsort(np.hypot(*detections.points_vehicle.T), kind="stable")[:NEAREST]
+        in_lane = bool(of_orange[nearest].all())
+    return merged(cones) if settings.of_lines else cones, detections.where(of_orange), in_lane
 
 
 def is_orange(detections: Detections) -> BoolArray:
@@ -184,15 +169,12 @@ def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[
     for odometry, _ in readings:
         twists.add(odometry)
     white = odometry_noise(twists, None)
-    check, sides = (
-        MotionCheck(
-            log.noise.twist if white is None else white.twist, settings.motion, of_lines=settings.of_lines
-        ),
-        SideJudge(settings.sides),
-    )
+    noise = log.noise.twist if white is None else white.twist
+    check = MotionCheck(noise, settings.motion, of_lines=settings.of_lines)
+    sides = SideJudge(settings.sides)
     for odometry, detections in readings:
         cones, _, in_lane = split_detections(detections, settings)
-        motion = check.update(odometry, cones, may_doubt=None)
+        motion = check.update(odometry, cones, "bridge")
         labelled = sides.update(check.pose, motion.twists, cones, in_lane=in_lane)
         cycles.append(SeenCycle(labelled, check.pose, motion.odometry.twist))
     return cycles, twists

@@ -102,7 +102,10 @@ class Gate(Copyable):
         dropped, notice = len(detections.labels) - len(possible.labels), "" if self._dropping else notice
         self.refused, self._refused_at, self._dropping = 0, None, dropped > 0
         since = _since(Odometry(stamps, twists), newest)
-        return Admitted(since, thinned(possible), dropped, refused, notice)
+        count = len(possible.labels)
+        one_of = max(-(-count // MOST_DETECTIONS), 1)  # of every few, where there are more than the most
+        possible = possible.where(np.arange(count) % one_of == 0)
+        return Admitted(since, possible, dropped, refused, notice)
 
     def refuse(self) -> None:
         self.refused += 1
@@ -115,17 +118,14 @@ def check_usable(log: Log, folder: Path, limits: LimitSettings) -> None:
         try:
             admitted = gate.admit(odometry, detections, newest)
         except ReadingError as error:
-            raise _of_file(error, folder, log, odometry) from error
+            file, row = DETECTIONS_FILE, None
+            if error.field.startswith("odometry"):
+                file = ODOMETRY_FILE
+                if error.row is not None:  # of the file, whose header is row 1
+                    row = int(log.odometry.t.searchsorted(odometry.t[error.row], side="right")) + 1
+            text = str(ReadingError(error.field, error.expected, error.found, t=error.t))
+            raise InputError(folder / file, text, row) from error
         newest = Newest(detections.t, admitted.odometry.twist[-1] if len(admitted.odometry.t) else None)
-
-
-def _of_file(error: ReadingError, folder: Path, log: Log, odometry: Odometry) -> InputError:
-    """Convert an error of a cycle with these twists to one of the log's file, whose header is row 1."""
-    of_odometry, row = error.field.startswith("odometry"), None
-    if of_odometry and error.row is not None:
-        row = int(log.odometry.t.searchsorted(odometry.t[error.row], side="right")) + 1
-    text = str(ReadingError(error.field, error.expected, error.found, t=error.t))
-    return InputError(folder / (ODOMETRY_FILE if of_odometry else DETECTIONS_FILE), text, row)
 
 
 def _stamp(value: Any) -> float:
@@ -228,12 +228,6 @@ def possible_detections(
     dropped = f"{count - int(good.sum())} of {count} detections dropped"
     notice = f"{dropped}: expected {expected}, found {found} in row {row}"
     return Detections(t, points[good], covariances[good], labels[good]), notice
-
-
-def thinned(detections: Detections) -> Detections:
-    """At most `MOST_DETECTIONS` of the detections, one of every few where there are more."""
-    count = len(detections.labels)
-    return detections.where(np.arange(count) % max(-(-count // MOST_DETECTIONS), 1) == 0)
 
 
 def _labels(values: Any, count: int) -> IntArray:

@@ -7,22 +7,19 @@ where the ray meets the line steeply, across the ray where it runs beside the li
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 import scipy  # which imports its modules when they are used
 
-from pathspace_graph.copies import shallow
-from pathspace_graph.factors import _kernels as kernels
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, huber_weights, ray_axes
 from pathspace_graph.factors.se2 import left_of, rotations, to_map
-from pathspace_graph.factors.sensor import BENDS_FROM
+from pathspace_graph.mapping.tracks import RECKONED
 
 from .measurement import (
     BINS,
-    FIRST_ACROSS,
-    FIRST_ALONG,
     LEAST_NOISE,
     MIN_ROWS,
     NEAR_SHARE,
@@ -30,12 +27,18 @@ from .measurement import (
     PRIOR,
     Rays,
     clustered,
+    derivatives_by_constants,
     line_through,
-    odometry_noise,
     runs,
     with_detections,
 )
-from .sightings import FOLLOW_RANGE, MAX_AGE, MIN_SPEED_SHARE, SeenCycle, Sightings, TwistRecord, by_bias
+from .sightings import (
+    FIRST_ACROSS,
+    FIRST_ALONG,
+    MIN_SPEED_SHARE,
+    SeenCycle,
+    Sightings,
+)
 
 CELL: Final = 4.0  # side of the cells (m) in which a line is a parabola; small ones cut off large errors
 MOST_POINTS: Final = 4000  # points that are measured on, which bounds the time of a round
@@ -67,17 +70,10 @@ class LineFit:
 
 def sightings_of(cycles: Sequence[SeenCycle]) -> Sightings:
     """Points of lines that were seen in motion, in order of time, with their labels for cells."""
-    t, twists = np.array([one.detections.t for one in cycles]), np.array([one.twist for one in cycles])
-    poses = np.array([one.pose for one in cycles])
-    derivatives, speed = by_bias(t, poses), np.hypot(twists[:, 0], twists[:, 1])
-    cycle = np.repeat(np.arange(len(cycles)), [len(one.detections.labels) for one in cycles])
-    points = np.concatenate([np.zeros((0, 2)), *(one.detections.points_vehicle for one in cycles)])
-    moving = (speed > MIN_SPEED_SHARE * np.median(speed))[cycle]
-    rows = np.flatnonzero(moving & (np.hypot(*points.T) < FOLLOW_RANGE))
-    rows = rows[:: max(-(-len(rows) // MOST_POINTS), 1)]
-    own = cycle[rows]
-    labels = np.concatenate([np.zeros(0, np.intp), *(one.detections.labels for one in cycles)])[rows]
-    return Sightings(labels, t[own], points[rows], twists[own], poses[own], derivatives[own])
+    table = Sightings.of(cycles)
+    least = MIN_SPEED_SHARE * np.median([np.hypot(*one.twist[:2]) for one in cycles])
+    table = table.where(np.hypot(*table.twist[:, :2].T) > least)
+    return table.where(slice(None, None, max(-(-len(table.t) // MOST_POINTS), 1)))
 
 
 def in_cells(table: Sightings, errors: Array) -> tuple[Sightings, IntArray, IntArray]:
@@ -86,11 +82,14 @@ def in_cells(table: Sightings, errors: Array) -> tuple[Sightings, IntArray, IntA
     Constant errors (7,) are undone. A cell that is seen again later is another one.
     """
     at = np.arange(len(table.t), dtype=np.intp)
-    cell = np.floor((to_map(table.point, table.pose) + _columns(table, at) @ errors) / CELL)
+    cell = np.floor(
+        (to_map(table.point, table.pose) + derivatives_by_constants(table, at, table.point) @ errors) / CELL
+    )
     cell = np.column_stack([cell, table.cone])
     order = np.lexsort((table.t, *cell.T))
     cell, t = cell[order], table.t[order]
-    new = (np.diff(cell, axis=0, prepend=np.nan) != 0.0).any(axis=1) | (np.diff(t, prepend=-np.inf) > MAX_AGE)
+    new = np.diff(t, prepend=-np.inf) > RECKONED
+    new |= (np.diff(cell, axis=0, prepend=np.nan) != 0.0).any(axis=1)
     number = np.cumsum(new) - 1
     ranges = np.hypot(*table.point[order].T)
     begins, counts = runs(number)
@@ -98,10 +97,6 @@ def in_cells(table: Sightings, errors: Array) -> tuple[Sightings, IntArray, IntA
     chosen = ((counts >= FEWEST) & (nearest < NEAR_SHARE * farthest))[number]
     table = replace(table.where(order[chosen]), cone=number[chosen])
     return table, *runs(table.cone)
-
-
-def _columns(table: Sightings, first: IntArray) -> Array:
-    return kernels.by_constants(table.point, table.twist, table.pose, table.by_bias, first, BENDS_FROM)
 
 
 def fit(table: Sightings, errors: Array, noise: Rays, walk: Array) -> LineFit | None:
@@ -112,10 +107,11 @@ def fit(table: Sightings, errors: Array, noise: Rays, walk: Array) -> LineFit | 
     table, begins, counts = in_cells(table, errors)
     if len(table.t) < MIN_ROWS:
         return None
-    columns = _columns(table, np.repeat(begins, counts))
+    columns = derivatives_by_constants(table, np.repeat(begins, counts), table.point)
     points, ranges = to_map(table.point, table.pose) + columns @ errors, np.hypot(*table.point.T)
     axes = np.einsum("nij,nkj->kni", rotations(table.pose[:, 2]), ray_axes(table.point))
-    drift = _drift(table, ranges, begins, counts, walk)
+    lag = np.abs(table.t - np.repeat(np.add.reduceat(table.t, begins) / counts, counts))
+    drift = lag * np.array([np.full(len(ranges), walk[0] ** 2), walk[1] ** 2 + (walk[2] * ranges) ** 2])
     variances = np.array([one.sigmas(ranges) ** 2 for one in noise]) + drift
     tangents, s, y = _frames(points, 1.0 / variances.sum(axis=0), begins, counts)
     basis = np.stack([np.ones(len(s)), s, s**2], axis=1)
@@ -144,14 +140,6 @@ def fit(table: Sightings, errors: Array, noise: Rays, walk: Array) -> LineFit | 
     middle = np.add.reduceat(table.t, begins) / counts
     spread = clustered(middle, scores, covariance)
     return LineFit(table, begins, counts, shares, ranges, drift, off, leverage, found, covariance, spread)
-
-
-def _drift(table: Sightings, ranges: Array, begins: IntArray, counts: IntArray, walk: Array) -> Array:
-    """Return the variances (2, n) of the odometry along and across the ray since the cell's mean (m^2)."""
-    middle = np.repeat(np.add.reduceat(table.t, begins) / counts, counts)
-    along = np.full(len(ranges), walk[0] ** 2)
-    across = walk[1] ** 2 + (walk[2] * ranges) ** 2
-    return np.asarray(np.abs(table.t - middle) * np.array([along, across]))
 
 
 def _frames(points: Array, weight: Array, begins: IntArray, counts: IntArray) -> tuple[Array, Array, Array]:
@@ -188,27 +176,17 @@ def noise_of(found: LineFit, noise: Rays) -> Rays:
     return along, across
 
 
-class LineMeasurement:
+class LineMeasurement(Copyable):
     """Measurement of noise by points of lines, in steps short enough for a perception cycle."""
 
     def __init__(self, cycles: Sequence[SeenCycle], found: MeasuredNoise) -> None:
         """Begin with the cycles of a drive, and with what is known: the noise of the odometry at least."""
         self._found, self._points = found, sightings_of(cycles)
         self._errors, self._rounds = np.zeros(len(PRIOR)), ROUNDS_FIRST
-        self._noise: Rays = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
-        if found.along is not None and found.across is not None:
-            self._noise, self._rounds = (found.along, found.across), ROUNDS_AGAIN
+        self._noise = found.along or FIRST_ALONG, found.across or FIRST_ACROSS
+        if found.along is not None:
+            self._rounds = ROUNDS_AGAIN
             self._errors = np.array([*found.sensor, found.range_bend, 0.0])
-
-    @classmethod
-    def of(cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None) -> Self | None:
-        """Return a measurement; None where not even the noise of the odometry can be told."""
-        found = odometry_noise(twists, known)
-        return None if found is None else cls(cycles, found)
-
-    def copy(self) -> Self:
-        """Return a copy that goes on independently: no attribute is changed in place."""
-        return shallow(self)
 
     def advance(self) -> MeasuredNoise | None:
         """Make the next round; return what was found if it is the last one."""

@@ -47,7 +47,8 @@ class LogOdometry:
 
     def rows_at(self, variables: Variables, settings: CalibrationSettings) -> list[Rows]:
         """Return all rows at the values of variables, with the prior of the sensor's calibration."""
-        return self.rows(variables.poses, variables.calibration) + sensor_prior(variables, settings)
+        rows = self.rows(variables.poses, variables.calibration)
+        return [*rows, sensor_prior(variables.sensor, settings)] if len(variables.sensor) else rows
 
     def priors(self, first: Array, calibration: Array) -> list[Rows]:
         """Return the rows of the priors at a first pose (3,) and a calibration (2,)."""
@@ -95,12 +96,10 @@ def mean_bias(measured: Sequence[BiasMeasurement]) -> BiasMeasurement | None:
     return BiasMeasurement(float(information @ values / information.sum()), float(information.sum() ** -0.5))
 
 
-def sensor_prior(variables: Variables, settings: CalibrationSettings) -> list[Rows]:
-    """Return the rows `(c - mean) / sigma` of the sensor's calibration c; none if it is not estimated."""
-    if len(variables.sensor) == 0:
-        return []
+def sensor_prior(calibration: Array, settings: CalibrationSettings, number: int = 0) -> Rows:
+    """Return the rows `(c - mean) / sigma` of the calibration c (5,) of a sensor."""
     root = np.diag(1.0 / np.array(settings.sigmas))
-    return [_prior(SENSOR_KEY, root, variables.sensor - settings.means)]
+    return _prior(SENSOR_KEY + number, root, calibration - settings.means)
 
 
 def half_square(groups: Sequence[Rows]) -> float:

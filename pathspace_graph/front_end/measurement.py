@@ -25,16 +25,22 @@ from pathspace_graph.factors.noise import (
 from pathspace_graph.factors.se2 import in_vehicle, rotations, to_map
 from pathspace_graph.factors.sensor import BENDS_FROM, SENSOR_SIZE
 
-from .sightings import FOLLOW_RANGE, MAD, MIN_SPEED_SHARE, ConeTracker, SeenCycle, Sightings, TwistRecord
+from .sightings import (
+    FIRST_ACROSS,
+    FIRST_ALONG,
+    FOLLOW_RANGE,
+    MAD,
+    MIN_SPEED_SHARE,
+    SeenCycle,
+    Sightings,
+    TwistRecord,
+)
 
 PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02, 0.02])
 """Prior standard deviations of the constants: errors of the sensor (rad, m, s, -, m), bend of its ranges
 (1/m) and bias of the yaw rate (rad/s). Without the bend, yaw, lateral offset and scale would absorb it."""
 OF_BEND: Final = SENSOR_SIZE  # index of the bend among the constants
-FIRST_ALONG: Final = (0.1, 0.04)  # initial noise along the ray: constant (m) and by range (-)
-FIRST_ACROSS: Final = (0.05, 0.016)  # initial noise across the ray: constant (m) and by range (rad)
 PASSES: Final = 4  # passes over the cycles, each of which tracks the cones again
-FOLLOWED: Final = 40  # cycles per step in which cones are tracked
 ROUNDS_FIRST: Final = 5  # alternations of errors, noise and weights in a pass
 ROUNDS_AGAIN: Final = 3  # alternations in a pass that starts from measured noise, nearly converged
 CLUSTER_TIME: Final = 3.0  # time (s) over which errors of the odometry are correlated
@@ -77,7 +83,7 @@ class _Cones:
         Noisy ranges would bias the weights towards short sightings and shrink the estimated errors.
         """
         seen = self.table.point - in_vehicle(off, self.table.pose)
-        columns = _columns(self.table, np.repeat(self.begins, self.counts), seen)
+        columns = derivatives_by_constants(self.table, np.repeat(self.begins, self.counts), seen)
         return replace(self, ranges=np.hypot(*seen.T), columns=columns)
 
     def on_axes(self, off: Array, rows: IntArray | slice = slice(None)) -> Array:
@@ -106,11 +112,15 @@ def _cones(sightings: Sightings) -> _Cones | None:
     begins, counts = runs(table.cone)
     axes = np.einsum("nij,nkj->kni", rotations(table.pose[:, 2]), ray_axes(table.point))
     points, ranges = to_map(table.point, table.pose), np.hypot(*table.point.T)
-    columns = _columns(table, np.repeat(begins, counts), table.point)
+    columns = derivatives_by_constants(table, np.repeat(begins, counts), table.point)
     return _Cones(table, begins, counts, axes, points, ranges, columns)
 
 
-def _columns(table: Sightings, first: IntArray, seen: Array) -> Array:
+def derivatives_by_constants(table: Sightings, first: IntArray, seen: Array) -> Array:
+    """Return the derivatives (n, 2, 7) by the constants of sightings at points `seen` (n, 2), vehicle frame.
+
+    The bias of the yaw rate counts from the first sighting of each cone or cell, at rows `first` (n,).
+    """
     return kernels.by_constants(seen, table.twist, table.pose, table.by_bias, first, BENDS_FROM)
 
 
@@ -165,15 +175,6 @@ def _residuals(cones: _Cones, errors: Array, noise: Rays, odometry: Array) -> tu
     return rows, offsets, known
 
 
-def pairs(groups: IntArray) -> tuple[IntArray, IntArray]:
-    """Return all ordered pairs of rows in the same group, by index; equal groups (n,) are adjacent."""
-    begins, counts = runs(groups)
-    repeats = np.repeat(counts, counts)
-    i = np.repeat(np.arange(len(groups)), repeats)
-    nth = np.arange(len(i)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
-    return i, np.repeat(np.repeat(begins, counts), repeats) + nth
-
-
 def _ray_noise(
     cones: _Cones, rows: IntArray, lagged: Lagged, off: Array, reference: Array, least: tuple[float, float]
 ) -> RayNoise:
@@ -206,8 +207,12 @@ def line_through(ranges: Array, sigma: Array) -> Array:
 
 
 def _lagged(cone: IntArray, t: Array) -> Lagged:
-    """Return the pairs of sightings (k,) of the same cone whose lags are within `LAGS`."""
-    i, j = pairs(cone)
+    """Return the ordered pairs of sightings (k,), sorted by cone, of one cone with a lag within `LAGS`."""
+    begins, counts = runs(cone)
+    repeats = np.repeat(counts, counts)
+    i = np.repeat(np.arange(len(cone)), repeats)
+    nth = np.arange(len(i)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+    j = np.repeat(np.repeat(begins, counts), repeats) + nth
     lag = t[j] - t[i]
     inside = (lag >= LAGS[0]) & (lag < LAGS[-1])
     return i[inside], j[inside], lag[inside], np.digitize(lag[inside], LAGS)
@@ -241,38 +246,20 @@ class Measurement(Copyable):
 
     def __init__(self, cycles: Sequence[SeenCycle], found: MeasuredNoise) -> None:
         """Start with the cycles of a drive and an estimate, which has the noise of the odometry at least."""
-        self._cycles, self._passes = cycles, PASSES if found.along is None else 1
-        self._begin(found)
-
-    @classmethod
-    def of(cls, cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None) -> Self | None:
-        """Return a measurement, or None if not even the noise of the odometry can be estimated."""
-        found = odometry_noise(twists, known)
-        return None if found is None else cls(cycles, found)
-
-    def _begin(self, found: MeasuredNoise) -> None:
-        self._found, self._tracker, self._followed = found, ConeTracker(found), 0
-        self._sightings: tuple[Sightings, ...] = ()
+        self._sightings, self._passes = Sightings.of(cycles), PASSES if found.along is None else 1
         self._cones: _Cones | None = None
+        self._found = found
 
     def advance(self) -> MeasuredNoise | None:
         """Take the next step; return the measured noise after the last one."""
         if self._cones is not None:
             return self._round(self._cones)
-        cycles = self._cycles[self._followed : self._followed + FOLLOWED]
-        self._sightings = (*self._sightings, self._tracker.follow(cycles))
-        self._followed += FOLLOWED
-        if self._followed < len(self._cycles):
-            return None
-        self._sightings = (Sightings.stacked(self._sightings),)
-        self._cones = _cones(self._sightings[0])
+        self._cones = _cones(self._sightings.tracked(self._found))
         if self._cones is None:
             return self._passed(self._found)
-        along, across, self._rounds = self._found.along, self._found.across, ROUNDS_AGAIN
-        if along is None or across is None:
-            along, across = RayNoise(np.array(FIRST_ALONG)), RayNoise(np.array(FIRST_ACROSS))
-            self._rounds = ROUNDS_FIRST
-        self._noise, self._weights = (along, across), np.ones(len(self._cones.ranges))
+        self._noise = self._found.along or FIRST_ALONG, self._found.across or FIRST_ACROSS
+        self._rounds = ROUNDS_AGAIN if self._found.along else ROUNDS_FIRST
+        self._weights = np.ones(len(self._cones.ranges))
         return None
 
     def _round(self, cones: _Cones) -> MeasuredNoise | None:
@@ -297,16 +284,16 @@ class Measurement(Copyable):
 
         The constant part of a cone's error shifts its position; only the rest biases the constants.
         """
-        stamps = np.unique(self._sightings[0].t)
+        stamps = np.unique(self._sightings.t)
         counts = int(np.median(cones.counts)), float(np.median(np.diff(stamps)))
         stays = max(one.inflation_of_slope(*counts) for one in self._noise)
         sigmas = np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))
-        per_cycle = len(self._sightings[0].t) / len(stamps)
+        per_cycle = len(self._sightings.t) / len(stamps)
         return with_detections(self._found, self._noise, errors, sigmas, cones.table.t, (*counts, per_cycle))
 
     def _passed(self, found: MeasuredNoise) -> MeasuredNoise | None:
         self._passes -= 1
-        self._begin(found)
+        self._found, self._cones = found, None
         return None if self._passes else found
 
 

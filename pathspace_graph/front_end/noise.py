@@ -18,7 +18,7 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .line_noise import LineMeasurement
-from .measurement import Measurement
+from .measurement import Measurement, odometry_noise
 from .sightings import SeenCycle, TwistRecord
 
 FIRST: Final = 8.0  # driving time before the first measurement of noise (s)
@@ -135,12 +135,15 @@ class NoiseLearner(Copyable):
         ranges keeps its own as long as that is known. Otherwise only the ratio of ranges and speeds is
         observable, so one of their scales is fixed.
         """
-        settings = self._with_stated(settings)
-        measured, sensor = self._measured_errors(settings), settings.calibration
+        settings, measured, contradicted = self._contradicted(settings)
+        sensor = settings.calibration
         if measured is None:
             return settings
-        contradicted = _contradicted(measured, settings)
-        known = self._knows_range_scale(measured, settings, contradicted)
+        # The prior of the ranges' scale is knowledge of the sensor if the log states it, or covariances at
+        # least. Ranges that bend, or have a contradicted scale, are not calibrated; those with a bias hardly
+        # are, unless the log says so.
+        known = self.known.sigma_range_scale is not None or not (self.of_detections or contradicted[BIAS])
+        known = known and not (sensor.trust is not None or contradicted[SCALE] or measured.range_bend)
         if not contradicted.any() and (known or sensor.trust is not None):
             return settings
         sigmas = np.maximum(measured.sensor_sigma, sensor.sigmas)
@@ -159,43 +162,35 @@ class NoiseLearner(Copyable):
         priors |= {f"sigma_{name}": sigma for name, sigma in zip(SENSOR, sigmas.tolist(), strict=True)}
         return replace(settings, odometry=odometry, calibration=replace(sensor, doubt=inf, **priors))
 
-    def _with_stated(self, settings: MapperSettings) -> MapperSettings:
-        """Return settings with the standard deviation of the ranges' scale that the log states."""
-        stated, sensor = self.known.sigma_range_scale, settings.calibration
-        if stated is None or stated == sensor.sigma_range_scale:
-            return settings
-        return replace(settings, calibration=replace(sensor, sigma_range_scale=stated))
+    def _contradicted(
+        self, settings: MapperSettings
+    ) -> tuple[MapperSettings, MeasuredNoise | None, BoolArray]:
+        """Return which measured errors (5,) of the sensor contradict their priors.
 
-    def _measured_errors(self, settings: MapperSettings) -> MeasuredNoise | None:
-        """Return the measurement with the constant errors of the sensor; None if they are not used."""
-        measured = self.measured
-        if (
-            not self.of_sensor
-            or not settings.calibration.sensor
-            or measured is None
-            or measured.along is None
-        ):
-            return None
-        return measured
-
-    def _knows_range_scale(
-        self, measured: MeasuredNoise, settings: MapperSettings, contradicted: BoolArray
-    ) -> bool:
-        """Whether the prior of the ranges' scale is what is known of the sensor.
-
-        The log states it, or at least covariances: then somebody knows the sensor. Ranges that bend, or with
-        a `contradicted` (5,) scale, are not calibrated. Those with a bias hardly are, unless the log says so.
+        The scale of the ranges is seen beside that of the speeds only. A sensor of which another prior is
+        contradicted is likelier to have a wrong scale as well, so less is needed (`DOUBT_SCALE`). The first
+        results are settings with the prior of the scale that the log states, and the measurement, which is
+        None if it is not used.
         """
-        if settings.calibration.trust is not None or contradicted[SCALE] or measured.range_bend:
-            return False
-        return self.known.sigma_range_scale is not None or not (self.of_detections or contradicted[BIAS])
+        stated, sensor, measured = self.known.sigma_range_scale, settings.calibration, self.measured
+        if stated is not None and stated != sensor.sigma_range_scale:
+            sensor = replace(sensor, sigma_range_scale=stated)
+            settings = replace(settings, calibration=sensor)
+        if not (self.of_sensor and sensor.sensor) or measured is None or measured.along is None:
+            return settings, None, np.zeros(len(SENSOR), bool)
+        prior = np.array(sensor.sigmas)
+        prior[SCALE] = np.hypot(prior[SCALE], settings.odometry.sigma_scale)
+        sigmas = np.abs(measured.sensor - sensor.means) / np.hypot(measured.sensor_sigma, prior)
+        contradicted = np.asarray(sigmas > sensor.doubt)
+        others = bool(np.delete(contradicted, SCALE).any())
+        contradicted[SCALE] = sigmas[SCALE] > DOUBT_SCALE[others] * sensor.doubt
+        return settings, measured, contradicted
 
     def used(self, settings: MapperSettings) -> RunNoise:
         """Return the noise in use, and the reading that sets the map's size if ranges and speeds disagree."""
         measured, known = self.measured, self.known
         size: Literal["odometry", "ranges"] | None = None
-        errors = self._measured_errors(settings)
-        if errors is not None and _contradicted(errors, self._with_stated(settings))[SCALE]:
+        if self._contradicted(settings)[2][SCALE]:
             size = "odometry" if self.trusts_odometry(settings) else "ranges"
         has_rays = measured is not None and measured.along is not None
         odometry = _source(known.odometry_stated, self.of_odometry, measured is not None)
@@ -215,21 +210,6 @@ class NoiseLearner(Copyable):
         return sigma > REFERENCE_RANGE * settings.odometry.sigma_scale
 
 
-def _contradicted(measured: MeasuredNoise, settings: MapperSettings) -> BoolArray:
-    """Return which measured errors (5,) of the sensor contradict their priors.
-
-    The scale of the ranges is seen beside that of the speeds only. A sensor of which another prior is
-    contradicted is likelier to have a wrong scale as well, so less is needed (`DOUBT_SCALE`).
-    """
-    sensor, prior = settings.calibration, np.array(settings.calibration.sigmas)
-    prior[SCALE] = np.hypot(prior[SCALE], settings.odometry.sigma_scale)
-    sigmas = np.abs(measured.sensor - sensor.means) / np.hypot(measured.sensor_sigma, prior)
-    contradicted = np.asarray(sigmas > sensor.doubt)
-    others = bool(np.delete(contradicted, SCALE).any())
-    contradicted[SCALE] = sigmas[SCALE] > DOUBT_SCALE[others] * sensor.doubt
-    return contradicted
-
-
 def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
     """Return the source of noise that is `stated` or not, to be `measured`, and measured so far (`known`)."""
     if stated and not (measured and known):
@@ -241,7 +221,8 @@ def begun(
     cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None, *, of_lines: bool
 ) -> Measurement | LineMeasurement | None:
     """Start a measurement on cones or on lines; None if not even the odometry's noise can be estimated."""
-    return (LineMeasurement if of_lines else Measurement).of(cycles, twists, known)
+    found = odometry_noise(twists, known)
+    return None if found is None else (LineMeasurement if of_lines else Measurement)(cycles, found)
 
 
 def measure_noise(

@@ -1,18 +1,18 @@
 """Input of noise measurement: sightings of cones tracked by dead reckoning, and the twists of a drive."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from math import comb
 from typing import Final
 
 import numpy as np
 
 from pathspace_graph.copies import Copyable
-from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.noise import MeasuredNoise
-from pathspace_graph.factors.se2 import left_of, to_map
+from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
+from pathspace_graph.factors.se2 import left_of, rotated, to_map
 from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.mapping.tracks import Tracks
 
 MAD: Final = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 MOST_TWISTS: Final = 4000  # largest number of newest twists
@@ -20,38 +20,11 @@ MOST_PARTS: Final = 200  # number of stored cycles after which these are reduced
 MIN_SPEED_SHARE: Final = 0.3  # least share of the median speed for the noise in motion
 MIN_TWISTS: Final = 30  # least number of twists for white noise
 FOLLOW_RANGE: Final = 30.0  # largest range of a tracked cone (m): few cones beyond are seen from near later
-MAX_AGE: Final = 3.0  # time without a sighting after which a track ends (s)
-GATE_UNKNOWN: Final = (0.4, 0.06, 1.5)  # gate `min(a + b r, c)` (m) at range r while noise is unknown
-FOLLOWING: Final = (0.5, 0.15)  # gains by which a track moves to a sighting: from nearer, and from farther
-GATE_SIGMAS: Final = 3.5  # gate along and across the ray (sigmas) once noise is known
-GATE_LEAST: Final = 0.4  # least gate (m)
-GATE_MOST: Final = 3.5  # largest gate (m)
-
-Cones = tuple[Array, IntArray, Array, Array, IntArray]
-"""Position (k, 2) of each tracked cone, its label (k,), least range, newest stamp and number."""
-
-
-@dataclass(eq=False)
-class Sightings:
-    """Table of sightings of cones, in order of time."""
-
-    cone: IntArray  # (n,) number of the cone
-    t: Array  # (n,) stamp (s)
-    point: Array  # (n, 2) measured point in m, vehicle frame
-    twist: Array  # (n, 3) twist of the vehicle (m/s, m/s, rad/s)
-    pose: Array  # (n, 3) pose by dead reckoning
-    by_bias: Array  # (n, 3) derivative of the pose by the bias of the yaw rate
-
-    @classmethod
-    def none(cls) -> "Sightings":
-        return cls(np.zeros(0, np.intp), np.zeros(0), np.zeros((0, 2)), *np.zeros((3, 0, 3)))
-
-    def where(self, rows: IntArray | BoolArray | slice) -> "Sightings":
-        return Sightings(*(getattr(self, column.name)[rows] for column in fields(self)))
-
-    @classmethod
-    def stacked(cls, tables: "Sequence[Sightings]") -> "Sightings":
-        return cls(*(np.concatenate([getattr(one, column.name) for one in tables]) for column in fields(cls)))
+GATE_LEAST: Final = 0.4  # distance within which a sighting is of a cone (m)
+GATE_MOST: Final = 3.0  # largest such distance (m); a narrow gate would cut off the noise
+GATE_SIGMAS: Final = 3.5  # gate in between, in sigmas of both
+FIRST_ALONG: Final = RayNoise(np.array([0.1, 0.04]))  # initial noise along the ray
+FIRST_ACROSS: Final = RayNoise(np.array([0.05, 0.016]))  # and across it
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,62 +36,41 @@ class SeenCycle:
     twist: Array  # (3,) twist of the vehicle (m/s, m/s, rad/s)
 
 
-def by_bias(t: Array, poses: Array, since: tuple[float, Array, Array] | None = None) -> Array:
-    """Return the derivatives (c, 3) of poses (c, 3) at t (c,) by the bias of the yaw rate.
+@dataclass(eq=False)
+class Sightings:
+    """Table of detections of static cones or points, in order of time."""
 
-    `since` is the stamp, pose and derivative (3,) of an earlier cycle, by default the first one.
-    """
-    stamp, pose, begun = since or (t[0], poses[0], np.zeros(3))
-    moved, dt = np.diff(poses[:, :2], axis=0, prepend=pose[None, :2]), np.diff(t, prepend=stamp)
-    turned = begun[2] - (t - stamp)
-    middle = turned + 0.5 * dt
-    derivatives = np.column_stack([np.cumsum(left_of(moved) * middle[:, None], axis=0), turned])
-    derivatives[:, :2] += begun[:2]
-    return derivatives
+    cone: IntArray  # (n,) number of the cone, or the label while cones are unknown
+    t: Array  # (n,) stamp (s)
+    point: Array  # (n, 2) measured point in m, vehicle frame
+    twist: Array  # (n, 3) twist of the vehicle (m/s, m/s, rad/s)
+    pose: Array  # (n, 3) pose by dead reckoning
+    by_bias: Array  # (n, 3) derivative of the pose by the bias of the yaw rate
 
-
-class ConeTracker(Copyable):
-    """Tracks of the cones seen in the last seconds, by dead reckoning."""
-
-    def __init__(self, known: MeasuredNoise) -> None:
-        self._known = known
-        none = np.zeros(0, np.intp)
-        self._cones: Cones = (np.zeros((0, 2)), none, np.zeros(0), np.zeros(0), none)
-        self._count = 0
-        self._from: tuple[float, Array, Array] | None = None  # stamp, pose and `by_bias` of the latest cycle
-
-    def follow(self, cycles: Sequence[SeenCycle]) -> Sightings:
-        """Track the cones through the next cycles; return the sightings by time and range."""
-        if not cycles:
-            return Sightings.none()
+    @classmethod
+    def of(cls, cycles: Sequence[SeenCycle]) -> "Sightings":
+        """Return the detections of cycles up to `FOLLOW_RANGE`, with labels for cones."""
         poses, twists = np.array([one.pose for one in cycles]), np.array([one.twist for one in cycles])
         seen = [one.detections for one in cycles]
-        t, labels = np.array([one.t for one in seen]), np.concatenate([one.labels for one in seen])
-        cycle = np.repeat(np.arange(len(seen)), [len(one.labels) for one in seen])
-        measured = np.concatenate([one.points_vehicle for one in seen])
-        ranges = np.hypot(*measured.T)
-        order = np.lexsort((ranges, cycle))
-        order = order[ranges[order] < FOLLOW_RANGE]
-        cycle, measured, ranges = cycle[order], measured[order], ranges[order]
-        points = to_map(self._known.corrected(measured, twists[cycle]), poses[cycle])
-        begins, gates = cycle.searchsorted(np.arange(len(cycles) + 1)), self._gates(ranges)
-        cycles_seen = begins, t, poses[:, :2].copy(), points, labels[order], ranges, *gates
-        cones, self._cones, self._count = kernels.followed(
-            *cycles_seen, self._cones, self._count, (MAX_AGE, *FOLLOWING)
-        )
-        of_cone, derivatives = cones >= 0, by_bias(t, poses, self._from)
-        self._from = t[-1], poses[-1], derivatives[-1]
-        own = cycle[of_cone]
-        return Sightings(cones[of_cone], t[own], measured[of_cone], twists[own], poses[own], derivatives[own])
+        t, points = np.array([one.t for one in seen]), np.concatenate([one.points_vehicle for one in seen])
+        labels, moved = np.concatenate([one.labels for one in seen]), np.diff(poses[:, :2], axis=0)
+        turned, own = t[0] - t, np.repeat(np.arange(len(seen)), [len(one.labels) for one in seen])
+        middle = turned[1:] + 0.5 * np.diff(t)
+        shift = np.concatenate([np.zeros((1, 2)), np.cumsum(left_of(moved) * middle[:, None], axis=0)])
+        table = cls(labels, t[own], points, twists[own], poses[own], np.column_stack([shift, turned])[own])
+        return table.where(np.hypot(*points.T) < FOLLOW_RANGE)
 
-    def _gates(self, ranges: Array) -> tuple[Array, Array]:
-        """Return the gates (m,) along and across the ray of detections at ranges (m,), in m."""
-        known = self._known
-        if known.along is None or known.across is None:
-            round_gate = np.minimum(GATE_UNKNOWN[0] + GATE_UNKNOWN[1] * ranges, GATE_UNKNOWN[2])
-            return round_gate, round_gate
-        along, across = (GATE_SIGMAS * ray.sigmas(ranges) for ray in (known.along, known.across))
-        return np.clip(along, GATE_LEAST, GATE_MOST), np.clip(across, GATE_LEAST, GATE_MOST)
+    def where(self, rows: IntArray | BoolArray | slice) -> "Sightings":
+        return Sightings(*(getattr(self, column.name)[rows] for column in fields(self)))
+
+    def tracked(self, noise: MeasuredNoise) -> "Sightings":
+        """Replace the labels by numbers of cones, which are tracked by dead reckoning."""
+        rays = replace(noise, along=noise.along or FIRST_ALONG, across=noise.across or FIRST_ACROSS)
+        covariances = rays.covariances(self.point, inflated=False)
+        assert covariances is not None
+        points = to_map(noise.corrected(self.point, self.twist), self.pose)
+        cones = Tracks(GATE_LEAST, most=GATE_MOST / GATE_LEAST, sigmas=GATE_SIGMAS)
+        return replace(self, cone=cones.add(points, rotated(covariances, self.pose[:, 2]), self.cone, self.t))
 
 
 class TwistRecord(Copyable):

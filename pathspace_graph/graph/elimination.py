@@ -1,9 +1,9 @@
 """A linear problem of poses and the map that they see: its solution and its covariances.
 
-GTSAM eliminates the poses, `p(poses, map) = p(poses | map) p(map)`, once for each linearization. What remains
-on the map is one dense matrix, which LAPACK factors for each damping that is tried. The poses follow by
-back-substitution. The map is every variable that is not a pose: control points or landmarks, and the
-calibration.
+For a solution, GTSAM eliminates poses and map in one order: on a long road a clique holds little more than
+what is seen around a place. For covariances it eliminates the poses, `p(poses, map) = p(poses | map) p(map)`,
+and one dense matrix remains on the map. The map is every variable that is not a pose: control points or
+landmarks, and the calibration.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.linalg import lapack
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array, IntArray
 
-from .gaussian import cholesky, factors_of, graph_of, keys_of, normal_equations, require_keys, solve
+from .gaussian import factorize, factors_of, graph_of, keys_of, normal_equations, require_keys
 from .rows import Rows, jacobian_factors
 from .variables import POSE, Layout, Variables, are_poses, indices, pose_keys, sizes
 
@@ -56,8 +56,28 @@ def fix_map(groups: Sequence[Rows]) -> list[Rows]:
     return on_poses
 
 
+def solution(graph: gtsam.GaussianFactorGraph, layout: Layout) -> Array:
+    """Return the solution (n,) of a graph on the variables of a layout.
+
+    Where round-off leaves a pose free, it is eliminated again as in `_eliminated`, from the last pose to the
+    first. SingularSystemError where the graph does not determine it, or holds no factor on a variable.
+    """
+    require_keys(graph, layout)
+    try:
+        found = graph.optimize(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
+    except RuntimeError:
+        poses = are_poses(layout.keys)
+        try:
+            found = graph.optimize(gtsam.Ordering([*layout.keys[poses][::-1], *layout.keys[~poses]]))
+        except RuntimeError as error:
+            raise SingularSystemError(
+                "expected a graph that determines all variables, found one that is free"
+            ) from error
+    return np.asarray(found.vector(layout.keys.tolist()))
+
+
 class Elimination:
-    """Linear problem whose poses have been eliminated."""
+    """Linear problem whose poses have been eliminated, for its covariances."""
 
     def __init__(self, graph: gtsam.GaussianFactorGraph, layout: Layout) -> None:
         """Eliminate the poses of a graph on the variables of a layout.
@@ -67,39 +87,15 @@ class Elimination:
         require_keys(graph, layout)
         poses = are_poses(layout.keys)
         self.poses = Layout(layout.keys[poses])
-        self.map = Layout(layout.keys[~poses])  # they come first in a solution
-        self._net, remaining = _eliminated(graph, self.map, len(self.poses.keys))
-        self.information, self.vector = np.zeros((0, 0)), np.zeros(0)
-        """The marginal of the map is `1/2 y' L y - g' y`, with information L (n, n) and vector g (n,)."""
-        if self.map.size:
-            self.information, self.vector = normal_equations(remaining, self.map)
-
-    # --- solution ----------------------------------------------------------------------------------------
-
-    def step(self, damping: Array) -> Array:
-        """Return the solution (n + 3 P,), where `damping` (n,) is added to the diagonal of the information.
-
-        SingularSystemError where the sum is not positive definite.
-        """
-        change = solve(cholesky(self.information + np.diag(damping)), self.vector)
-        return np.concatenate([change, self.poses_given(change)])
-
-    def poses_given(self, change: Array) -> Array:
-        """Return the solution of the poses (3 P,), given a change of the map (n,)."""
-        given = gtsam.VectorValues()
-        own = np.split(change, self.map.starts[1:])
-        for key, values in zip(self.map.keys.tolist(), own if self.map.size else [], strict=True):
-            given.insert(key, values)
-        return np.asarray(self._net.optimize(given).vector(self.poses.keys.tolist()))
-
-    # --- covariances -------------------------------------------------------------------------------------
+        self.map = Layout(layout.keys[~poses])
+        self._net, self._remaining = _eliminated(graph, self.map, len(self.poses.keys))
 
     @cached_property
     def map_covariance(self) -> Array:
         """Return the joint covariance (n, n) of the map's variables, in the order of their keys."""
         if self.map.size == 0:
             return np.zeros((0, 0))
-        inverse, _ = lapack.dpotri(cholesky(self.information.copy()), lower=1)
+        inverse, _ = lapack.dpotri(factorize(self._remaining, self.map).factor, lower=1)
         return np.asarray(np.tril(inverse) + np.tril(inverse, -1).T)
 
     def joint(self, keys: IntArray) -> Array:

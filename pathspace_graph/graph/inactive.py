@@ -89,13 +89,13 @@ def relative_factor(
     information = information[np.ix_(own, own)]
     root, right = square_root_form(information, vector - information @ variables.change(entries))
     local = to_frame(variables.values[entries], pose, kept)
-    return RelativeFactor(frame, kept, root @ rotations(kept, pose[2]), right, local)
+    return RelativeFactor(frame, kept, root @ rotation_of_keys(kept, pose[2]), right, local)
 
 
 # --- coordinates in the frame of a pose ------------------------------------------------------------------
 
 
-def rotations(keys: Layout, heading: float) -> Array:
+def rotation_of_keys(keys: Layout, heading: float) -> Array:
     """Return the rotation (q, q) of points and poses from a frame with a heading (rad) to the map frame."""
     x = keys.turning
     return rotation_blocks(keys.size, x, np.full(len(x), heading))
@@ -420,7 +420,7 @@ def new_link(
     placed[:, keys.entries(order[order != frame])] = A[:, columns != frame]
     entries = variables.layout.entries(keys.keys)
     right -= placed @ variables.change(entries)
-    root = placed @ rotations(keys, pose[2])
+    root = placed @ rotation_of_keys(keys, pose[2])
     factor = RelativeFactor(frame, keys, root, right, to_frame(variables.values[entries], pose, keys))
     own, others = Layout(leaving), Layout(np.setdiff1d(keys.keys, leaving))
     solved = np.linalg.solve(

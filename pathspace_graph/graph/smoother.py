@@ -34,7 +34,7 @@ from .gaussian import (
     sparse_marginal,
 )
 from .inactive import Attached, InactiveChain, InactiveMap
-from .rows import Rows, calibrated_delta, newton_system, predicted_covariance
+from .rows import Rows, at_values, calibrated_delta, newton_system, predicted_covariance, stacked_factor
 from .variables import CALIBRATION_KEY, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys, sizes
 from .window import M_co, MapRows, SmootherSettings, UserFactors, WindowFactors, check_factors, values_of
 
@@ -186,6 +186,11 @@ class FixedLagSmoother(Generic[M_co]):
         keys, row = np.array([CALIBRATION_KEY]), np.array([[0.0, 1.0 / sigma]])
         measured = absolute_factor(keys, row, self.variables, np.array([0.0, value]))
         self.prior = graph_of(self.prior, measured)
+
+    def add_to_prior(self, groups: Sequence[Rows]) -> None:
+        """Add rows at values of zero to the prior, each group as a factor."""
+        factors = (stacked_factor([at_values(rows, self.variables)], self.variables) for rows in groups)
+        self.prior = graph_of(self.prior, *(factor for found in factors for factor in found))
 
     # --- update: Gauss-Newton ----------------------------------------------------------------------------
 
@@ -339,30 +344,22 @@ class FixedLagSmoother(Generic[M_co]):
             self.prior = graph_of(as_rows(graph_of(self.prior, self.chain.detach(self.variables))))
             self.map.activate(back)
 
-    def reactivate(self, with_prior: bool = True) -> None:
-        """Make all variables active, with their prior, or with none that a marginal replaces."""
+    def reactivate(self) -> None:
+        """Make all variables active, and marginalize the poses that are older than the window."""
         chain = self.chain
         if chain is None and len(self.inactive) == 0:
             return
         self.transform_to_origin()
-        if not with_prior:
-            self.prior = gtsam.GaussianFactorGraph()
-            self.variables.remove(self.variables.keyframes)
-        elif chain is not None:  # its anchors become keyframes
+        if chain is not None:  # its anchors become keyframes
             self.prior = graph_of(self.prior, *(chain.detach(self.variables) for _ in range(len(chain))))
         else:
             self.prior = self.inactive.joint_prior(self.prior)
         self.inactive = InactiveMap()
         self.user_factors.reactivate()
-        if with_prior:
-            self.marginalize_keyframes()
-        self.map.activate_all()
-
-    def marginalize_keyframes(self) -> None:
-        """Marginalize the poses that are older than the window."""
         keyframes = self.variables.keyframes
         self.prior = marginalize(self.prior, keyframes)
         self.variables.remove(keyframes)
+        self.map.activate_all()
 
     def remove_information(self, keys: IntArray) -> None:
         """Remove what the prior says about map points (k,), which become active."""
@@ -434,16 +431,18 @@ def forget_poses(smoother: Smoother, first_cycle: int) -> None:
     _drop_before(smoother, first_cycle)
 
 
-def restart(smoother: Smoother, first_cycle: int, removed: IntArray, added: IntArray, points: Array) -> None:
-    """Replace map points `removed` (n,) by `added` (k,) at `points` (k, 2), and drop the prior.
+def restart(smoother: Smoother, first_cycle: int) -> None:
+    """Make all variables active, and drop the prior; poses before `first_cycle` leave the window.
 
-    Poses before `first_cycle` leave the window. A new prior must be set, on all that remains.
+    A new prior must be set, on all that remains.
     """
+    smoother.transform_to_origin()
+    smoother.user_factors.reactivate()
+    smoother.map.activate_all()
     smoother.inactive = InactiveMap()
     smoother.held, smoother.prior = None, gtsam.GaussianFactorGraph()
-    smoother.variables.remove(np.append(smoother.variables.keyframes, removed))
+    smoother.variables.remove(smoother.variables.keyframes)
     _drop_before(smoother, first_cycle)
-    smoother.variables.insert(added, points.ravel())
 
 
 def _drop_before(smoother: Smoother, first_cycle: int) -> None:

@@ -4,7 +4,7 @@ This is the fluid relinearization of iSAM2 (Kaess et al. 2012). No linearization
 frozen.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, Protocol, Self, TypeVar
 
@@ -257,6 +257,10 @@ class UserFactors:
         """Remove every factor that holds one of these variables (k,), and return them linearized."""
         return _linear(self._taken(keys), variables)
 
+    def drop(self, factors: Sequence[gtsam.NonlinearFactor | None]) -> None:
+        """Drop some of the active factors, which another prior includes."""
+        self.factors = [one for one in self.factors if one not in factors]
+
     def deactivate(self, keys: IntArray, variables: Variables) -> list[gtsam.GaussianFactor]:
         """Deactivate factors on one of the map points (k,) and on no pose, and return them linearized."""
         inactive = self._taken(keys, with_poses=False)
@@ -271,22 +275,17 @@ class UserFactors:
         taken = [
             one
             for one in self.factors
-            if np.isin(keys_of_factor(one), keys).any() and (with_poses or not _holds_pose(one))
+            if np.isin(held := keys_of_factor(one), keys).any() and (with_poses or not are_poses(held).any())
         ]
         self.factors = [one for one in self.factors if one not in taken]
         return taken
 
 
-def rows_on_poses(factors: Sequence[gtsam.NonlinearFactor], variables: Variables) -> list[Rows] | None:
-    """Return user's factors on poses and calibrations as rows at values of zero, linearized now.
-
-    None where one holds points of the map, which are others in a batch. Its first pose owns the rows.
-    """
+def user_rows(factors: Sequence[gtsam.NonlinearFactor], variables: Variables) -> list[Rows]:
+    """Return user's factors as rows at values of zero, linearized now; the first pose owns the rows."""
     found = []
     for linear in _linear(factors, variables):
         keys, (A, b) = keys_of_factor(linear), linear.jacobian()
-        if not (are_poses(keys) | np.isin(keys, variables.calibration_keys)).all():
-            return None
         residual = -np.ravel(b) - A @ variables.reference[variables.layout.entries(keys)]
         cycles = np.append(indices(keys[are_poses(keys)]), 0)  # of its poses; none of the calibration alone
         owner = np.repeat(owners(cycles[:1]), len(A))
@@ -294,18 +293,34 @@ def rows_on_poses(factors: Sequence[gtsam.NonlinearFactor], variables: Variables
     return found
 
 
-def _holds_pose(factor: gtsam.NonlinearFactor) -> bool:
-    return bool(are_poses(keys_of_factor(factor)).any())
-
-
 def check_keys(factors: Sequence[gtsam.NonlinearFactor], known: IntArray, expected: str) -> None:
-    """Raise a SettingsError for the first factor that is not one, or that holds another key than `known`."""
+    """Raise a SettingsError for the first factor that is not one, or without keys or with an unknown key."""
     for row, factor in enumerate(factors):
         if not isinstance(factor, gtsam.NonlinearFactor):
             raise _unusable(row, "a gtsam.NonlinearFactor", type(factor).__name__)
-        unknown = np.setdiff1d(keys_of_factor(factor), known)
-        if len(unknown):
-            raise _unusable(row, f"keys of {expected}", name(int(unknown[0])))
+        keys = keys_of_factor(factor)
+        unknown = np.setdiff1d(keys, known)
+        if len(unknown) or len(keys) == 0:
+            raise _unusable(row, f"keys of {expected}", name(int(unknown[0])) if len(unknown) else "no key")
+
+
+def check_linear(
+    factors: Sequence[gtsam.NonlinearFactor], values: Callable[..., gtsam.Values], constant: bool = True
+) -> None:
+    """Raise a SettingsError for the first factor that cannot be linearized at its values.
+
+    `constant` allows residuals that depend on nothing; those of zero always may, as of a limit that is kept.
+    """
+    for row, factor in enumerate(factors):
+        try:
+            linear = factor.linearize(values(factor))
+        except Exception as error:  # whatever a user's own function raises, or GTSAM where types differ
+            raise _unusable(row, "a factor that can be linearized", error) from error
+        A, b = linear.jacobian() if linear is not None else (np.zeros(0), np.zeros(0))
+        if not (np.isfinite(A).all() and np.isfinite(b).all()):
+            raise _unusable(row, "finite numbers", "others where it is linearized")
+        if not constant and np.any(b) and not np.any(A):
+            raise _unusable(row, "a residual that depends on its variables", "Jacobians of zero")
 
 
 def check_factors(factors: Sequence[gtsam.NonlinearFactor], variables: Variables, next_cycle: int) -> None:
@@ -321,13 +336,7 @@ def check_factors(factors: Sequence[gtsam.NonlinearFactor], variables: Variables
         f"poses in the window, {name(first)} to {name(following)}, of control points and of the calibration"
     )
     check_keys(factors, keys_known, expected)
-    for row, factor in enumerate(factors):
-        try:
-            linear = factor.linearize(values_of(factor, next_cycle, variables))
-        except Exception as error:  # whatever a user's own function raises, or GTSAM where types differ
-            raise _unusable(row, "a factor that can be linearized", error) from error
-        if linear is not None and not all(np.isfinite(part).all() for part in linear.jacobian()):
-            raise _unusable(row, "finite numbers", "others where it is linearized")
+    check_linear(factors, lambda factor: values_of(factor, next_cycle, variables))
 
 
 def values_of(factor: gtsam.NonlinearFactor, next_cycle: int, variables: Variables) -> gtsam.Values:

@@ -15,6 +15,24 @@ def frames() -> Any:
     return import_module("pathspace_graph.frames")
 
 
+def notebook() -> Any:
+    return import_module("pathspace_graph.eval.figures.notebook")
+
+
+def notebook_html(record: Any) -> str | None:
+    """HTML of a record for a notebook, which shows its text where this is None: without the extra `eval`."""
+    try:
+        return str(notebook().html(record))
+    except ModuleNotFoundError:
+        return None
+
+
+class Shown:
+    """A record that a notebook shows as HTML."""
+
+    _repr_html_ = notebook_html
+
+
 class Brief:
     """A record whose text has the shapes of its arrays in place of their numbers."""
 

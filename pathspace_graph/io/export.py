@@ -22,15 +22,12 @@ from .files import to_plain, write_table
 from .log import COLUMNS, TRUTH_CONES_FILE
 from .map import Map, MapBoundary, PointBoundary, SplineBoundary
 
-CENTRE_LINE: Final = ("# x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # columns of TUM's raceline format
-PROFILE: Final = ("# s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2")  # of its trajectories
-_FEWEST_INTERVALS: Final = 4  # least number of intervals of a spaced boundary
-
 
 def write_centre_line(file: Path, track: Map, step: float) -> None:
     """Write the centre line in TUM's raceline format, `step` (m) apart; a loop ends before its start."""
     line = track.centre_line(step)
-    write_table(file, CENTRE_LINE, line.points, line.width_right, line.width_left)
+    names = ("# x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
+    write_table(file, names, line.points, line.width_right, line.width_left)
 
 
 def write_profile(
@@ -47,7 +44,8 @@ def write_profile(
         most = f"{profile.speed[0]:.3g} m/s on this line"
         raise SettingsError(f"expected a start speed of at most {most}, found {start:g}")
     curve = line.arc_length, line.points, line.heading, line.curvature
-    write_table(file, PROFILE, *curve, profile.speed, profile.acceleration)
+    names = ("# s_m", "x_m", "y_m", "psi_rad", "kappa_radpm", "vx_mps", "ax_mps2")
+    write_table(file, names, *curve, profile.speed, profile.acceleration)
 
 
 def write_points(file: Path, track: Map, step: float) -> None:
@@ -63,7 +61,7 @@ def boundary_points(boundary: MapBoundary, step: float) -> Array:
     return boundary.points if isinstance(boundary, PointBoundary) else spaced(boundary.spline, step)
 
 
-def spaced(spline: BSpline, step: float, fewest: int = _FEWEST_INTERVALS) -> Array:
+def spaced(spline: BSpline, step: float, fewest: int = 4) -> Array:
     """Points (n, 2) of a curve about `step` (m) apart; the first of a closed one isn't repeated."""
     length = spline.length()
     at = np.linspace(0.0, length, max(round(length / step), fewest) + 1)
@@ -107,18 +105,6 @@ class LocalPlane:
 
 # --- GeoJSON ---------------------------------------------------------------------------------------------
 
-CENTRE: Final = "centre"  # name of the centre line
-_PROPERTIES: Final = (  # of the centre line: values of an attribute at its points, none at a repeated one
-    ("arc_length_m", "arc_length"),
-    ("curvature_per_m", "curvature"),
-    ("width_left_m", "width_left"),
-    ("width_right_m", "width_right"),
-    ("across_sigma_m", "points_sigma"),
-    ("curvature_sigma_per_m", "curvature_sigma"),
-    ("width_left_sigma_m", "width_left_sigma"),
-    ("width_right_sigma_m", "width_right_sigma"),
-)
-
 
 def write_geojson(file: Path, track: Map, step: float, plane: LocalPlane) -> None:
     """Write curves, by points `step` (m) apart, as LineStrings with a centre line, cones as MultiPoints."""
@@ -137,8 +123,17 @@ def write_geojson(file: Path, track: Map, step: float, plane: LocalPlane) -> Non
         features.append(feature(kind, boundary_points(boundary, step), closed, properties))
     if all(isinstance(track.boundaries.get(label), SplineBoundary) for label in BOUNDARIES):
         line = track.centre_line(step)
-        properties = {"name": CENTRE, "closed": line.closed, "length_m": line.length}
-        properties |= {name: getattr(line, attribute) for name, attribute in _PROPERTIES}
+        properties = {"name": "centre", "closed": line.closed, "length_m": line.length}
+        properties |= {  # values at its points, none at a repeated one
+            "arc_length_m": line.arc_length,
+            "curvature_per_m": line.curvature,
+            "width_left_m": line.width_left,
+            "width_right_m": line.width_right,
+            "across_sigma_m": line.points_sigma,
+            "curvature_sigma_per_m": line.curvature_sigma,
+            "width_left_sigma_m": line.width_left_sigma,
+            "width_right_sigma_m": line.width_right_sigma,
+        }
         features.append(feature("LineString", line.points, line.closed, properties))
     origin = {"latitude_deg": plane.latitude, "longitude_deg": plane.longitude, "heading_deg": plane.heading}
     content = to_plain({"type": "FeatureCollection", "origin": origin, "features": features})
@@ -147,18 +142,8 @@ def write_geojson(file: Path, track: Map, step: float, plane: LocalPlane) -> Non
 
 # --- Lanelet2 --------------------------------------------------------------------------------------------
 
-WAY_TAGS: Final = {"type": "line_thin", "subtype": "solid"}  # lines that must not be crossed
-LANELET_TAGS: Final = {  # tags of a lanelet: a road for vehicles, in the direction of travel
-    "type": "lanelet",
-    "subtype": "road",
-    "location": "nonurban",
-    "one_way": "yes",
-    "participant:vehicle": "yes",
-}
-CONE: Final = "cone"  # type of the node of an orange cone, whose subtype is its label
 _PIECES: Final = 4  # lanelets of a loop; Lanelet2 knows neither length nor successor of a single one
 _FEWEST_WAY_INTERVALS: Final = 2
-_DECIMALS: Final = 5  # number of decimals of local coordinates (m)
 
 
 class _Osm:
@@ -180,7 +165,7 @@ class _Osm:
         nodes = []
         for (x, y), degrees in zip(points.tolist(), self._plane.to_geodetic(points).tolist(), strict=True):
             latitude, longitude = (f"{one:.{_DECIMALS_DEGREES}f}" for one in degrees)
-            place = {"local_x": f"{x:.{_DECIMALS}f}", "local_y": f"{y:.{_DECIMALS}f}", "ele": "0.0"}
+            place = {"local_x": f"{x:.5f}", "local_y": f"{y:.5f}", "ele": "0.0"}
             nodes.append(self.add("node", place | tags, [], lat=latitude, lon=longitude))
         return nodes
 
@@ -202,9 +187,12 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
             piece.append(following[0])
         sides.append(pieces)
     for label, cones in sorted(track.points.items()):
-        osm.add_nodes(cones.points, {"type": CONE, "subtype": NAMES[label]})
+        osm.add_nodes(cones.points, {"type": "cone", "subtype": NAMES[label]})
+    solid = {"type": "line_thin", "subtype": "solid"}  # must not be crossed
+    road = {"type": "lanelet", "subtype": "road", "location": "nonurban"}
+    road |= {"one_way": "yes", "participant:vehicle": "yes"}  # for vehicles, in the direction of travel
     ways = [
-        [osm.add("way", WAY_TAGS, [ET.Element("nd", ref=node) for node in nodes]) for nodes in pieces]
+        [osm.add("way", solid, [ET.Element("nd", ref=node) for node in nodes]) for nodes in pieces]
         for pieces in sides
     ]
     for pair in zip(*ways, strict=True):
@@ -212,7 +200,7 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
             ET.Element("member", type="way", ref=way, role=NAMES[label])
             for label, way in zip(BOUNDARIES, pair, strict=True)
         ]
-        osm.add("relation", LANELET_TAGS, members)
+        osm.add("relation", road, members)
     ET.indent(osm.root)
     ET.ElementTree(osm.root).write(file, encoding="UTF-8", xml_declaration=True)
 

@@ -9,7 +9,7 @@ import re
 import secrets
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,7 +30,7 @@ def atomic_folder(target: Path | str, marker: str, *, force: bool = False) -> It
     An earlier result, recognized by the file `marker`, is replaced if `force`, and an OutputError without.
     Anything else except an empty folder is an OutputError.
     """
-    final = _followed(target)
+    final = Path(target).resolve()
     check_target(final, marker, force=force)
     with _beside(final, Path.mkdir) as temporary:
         yield temporary
@@ -62,7 +62,7 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
     An earlier file is replaced. Symbolic links are followed. Standard output (`-`), a device and a pipe are
     written in place.
     """
-    path, final = Path(path), _followed(path)
+    path, final = Path(path), Path(path).resolve()
     if is_stream(path):
         with TemporaryDirectory() as folder:
             temporary = Path(folder, path.name)
@@ -74,8 +74,9 @@ def atomic_file(path: Path | str) -> Iterator[Path]:
                     stream.flush()
         return
     check_file_target(final)
-    with replacing(final) as temporary:
+    with _beside(final, Path.touch) as temporary:
         yield temporary
+        temporary.replace(final)
 
 
 def is_stream(path: Path) -> bool:
@@ -83,17 +84,9 @@ def is_stream(path: Path) -> bool:
     return path == STDOUT or (path.exists() and not path.is_file() and not path.is_dir())
 
 
-@contextmanager
-def replacing(file: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `file` that takes its place on success."""
-    with _beside(file, Path.touch) as temporary:
-        yield temporary
-        temporary.replace(file)
-
-
 def write_text(file: Path, text: str) -> None:
     """Write text in UTF-8, whole or not at all; an earlier file is replaced."""
-    with replacing(file) as temporary:
+    with atomic_file(file) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
@@ -115,12 +108,12 @@ def write_json(file: Path, content: Any, indent: int | None = 2) -> None:
     write_text(file, json.dumps(to_plain(content), indent=indent, allow_nan=False) + "\n")
 
 
-def write_table(file: Path, names: Iterable[str], *values: ArrayLike) -> None:
-    """Write a CSV file of columns (rows,) or (rows, k); numbers read back as the same ones."""
+def write_table(file: Path, names: Collection[str], *values: ArrayLike, delimiter: str = ",") -> None:
+    """Write a CSV file of columns (rows,) or (rows, k) below their names, if any; numbers read back equal."""
     columns = [column for value in values for column in np.atleast_2d(np.asarray(value).T).tolist()]
     with file.open("w", encoding="utf-8", newline="") as out:
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(names)
+        writer = csv.writer(out, delimiter=delimiter, lineterminator="\n")
+        writer.writerows([names] if names else [])
         writer.writerows(zip(*columns, strict=True))
 
 
@@ -131,7 +124,7 @@ def check_target(target: Path | str, marker: str, *, force: bool = False) -> Non
     """Raise an OutputError where `atomic_folder` would lose files at `target`, or fail."""
     if Path(target) == STDOUT:
         raise OutputError(f"{STDOUT}: expected a folder to write; only one file goes to standard output")
-    target = _followed(target)
+    target = Path(target).resolve()
     _check_parents(target)
     if not target.exists():
         return
@@ -152,14 +145,10 @@ def check_file_target(path: Path | str) -> None:
     """Raise an OutputError where `atomic_file` could not write `path`."""
     if is_stream(Path(path)):
         return
-    path = _followed(path)
+    path = Path(path).resolve()
     _check_parents(path)
     if path.is_dir():
         raise OutputError(f"{path}: expected a file to write, found a folder")
-
-
-def _followed(path: Path | str) -> Path:
-    return Path(os.path.realpath(path))
 
 
 def _check_parents(target: Path) -> None:

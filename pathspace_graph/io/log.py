@@ -19,7 +19,7 @@ from pathspace_graph.labels import NAMES, UNKNOWN, Kind, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
 
 from . import parsing as limits
-from .brief import Brief, pictures
+from .brief import Brief, Shown, pictures
 from .parsing import Column, Table
 
 if TYPE_CHECKING:
@@ -35,17 +35,16 @@ TRUTH_ASSOCIATIONS_FILE: Final = "truth_associations.csv"
 _STAMP: Final = {"t": Column(limits.MAX_STAMP, "s")}
 _POINT: Final = {"x": Column(unit="m"), "y": Column(unit="m")}
 _LABEL: Final = Column(len(NAMES) - 1)
-_SPEED: Final = Column(limits.MAX_SPEED, "m/s")
+_SPEED: Final = Column(1e3, "m/s")
 _RANGE: Final = Column(limits.MAX_RANGE, "m")
-_COVARIANCE: Final = Column(limits.MAX_RANGE**2, "m^2")
 COLUMNS: Final[dict[str, dict[str, Column]]] = {  # of each table, in the order of the file
-    ODOMETRY_FILE: {**_STAMP, "vx": _SPEED, "vy": _SPEED, "wz": Column(limits.MAX_YAW_RATE, "rad/s")},
+    ODOMETRY_FILE: {**_STAMP, "vx": _SPEED, "vy": _SPEED, "wz": Column(1e3, "rad/s")},
     DETECTIONS_FILE: {
         **_STAMP,
         **{"x": _RANGE, "y": _RANGE, "label": _LABEL},
-        **dict.fromkeys(("xx", "xy", "yy"), _COVARIANCE),
+        **dict.fromkeys(("xx", "xy", "yy"), Column(limits.MAX_RANGE**2, "m^2")),
     },
-    TRUTH_POSES_FILE: {**_STAMP, **_POINT, "theta": Column(limits.MAX_ANGLE, "rad")},
+    TRUTH_POSES_FILE: {**_STAMP, **_POINT, "theta": Column(1e6, "rad")},
     TRUTH_CONES_FILE: {**_POINT, "label": _LABEL},
     TRUTH_ASSOCIATIONS_FILE: {"cone": Column()},
 }
@@ -169,7 +168,7 @@ class Truth(Brief):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Log:
+class Log(Shown):
     """All that a vehicle recorded on one drive."""
 
     LENGTHS: ClassVar = {

@@ -10,7 +10,6 @@ from msgspec import Meta, Struct, defstruct
 from msgspec.structs import asdict, astuple
 
 from pathspace_graph.errors import InputError, check_type
-from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.odometry import CALIBRATION
 from pathspace_graph.factors.sensor import SENSOR
@@ -36,7 +35,6 @@ TRUE_ERRORS: Final = {  # entries of the truth, by the field of `io.log:Truth` t
 Number = Annotated[float, Meta(ge=-MAX_NOISE, le=MAX_NOISE)]
 AtLeast0 = Annotated[float, Meta(ge=0.0, le=MAX_NOISE)]
 Positive = Annotated[float, Meta(gt=0.0, le=MAX_NOISE)]
-Kind = Annotated[str, Meta(pattern=f"^({'|'.join(KINDS)})$")]
 Origin = Annotated[str, Meta(pattern=f"^({'|'.join((STATED, *UNSTATED))})$")]
 Ray = tuple[AtLeast0, AtLeast0, Annotated[float, Meta(ge=0.0, le=1.0)], Positive]  # fields of a `RayNoise`
 Error = tuple[Number, Positive]  # an error of the sensor and its sigma
@@ -51,7 +49,7 @@ class _Sensor(Struct, frozen=True):
     range_max: Positive | None = None
     fov: Positive | None = None
     rate: Positive | None = None
-    kind: Kind | None = None
+    kind: Annotated[str, Meta(pattern=f"^({'|'.join(KINDS)})$")] | None = None
     sigma_range_scale: Positive | None = None
 
 
@@ -93,11 +91,6 @@ class Header(Struct):
     truth: dict[str, Any] = {}
 
 
-_TRUTH: Final = {
-    name: defstruct(name, [(entry, Number) for entry in entries]) for name, entries in TRUE_ERRORS.items()
-}
-
-
 # --- reading -------------------------------------------------------------------------------------------
 
 
@@ -123,7 +116,7 @@ def read_log(folder: Path | str) -> Log:
         detections_stated=header.noise.detections == STATED,
         odometry_drift=None if (drift := header.odometry.drift_sigmas) is None else np.array(drift),
         measured=measured_noise(header, file),
-        truth=_read_truth(folder, len(table), true_errors(header, file)),
+        truth=_read_truth(folder, len(table), header.truth, file),
         scale=header.scale,
     )
 
@@ -135,10 +128,16 @@ def _table(folder: Path, name: str) -> Table:
     return read_table(folder / name, logs.COLUMNS[name])
 
 
-def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) -> Truth | None:
+def _read_truth(folder: Path, detection_count: int, stated: dict[str, Any], file: Path) -> Truth | None:
+    """Truth of the tables and of what the header states, where each group of errors is whole."""
     known = [(folder / name).exists() for name in logs.TRUTH_FILES]
-    if not errors and not any(known):
+    if not stated and not any(known):
         return None
+    errors = {}
+    for name, entries in TRUE_ERRORS.items():
+        if stated and (name == "calibration" or not stated.keys().isdisjoint(entries)):
+            group = defstruct(name, [(entry, Number) for entry in entries])
+            errors[name] = np.array(astuple(typed(stated, group, file, "truth")))
     poses, cones, table = (_table(folder, name) for name in logs.TRUTH_FILES)
     t, points = logs.increasing_times(poses), cones.stack(("x", "y"))
     truth = Truth(t, poses.stack(("x", "y", "theta")), points, logs.labels_of(cones), None, **errors)
@@ -151,16 +150,6 @@ def _read_truth(folder: Path, detection_count: int, errors: dict[str, Array]) ->
     good = (index == np.floor(index)) & (index >= -1) & (index < len(points))
     table.require(good, f"expected -1 or the index of one of {len(points)} true cones")
     return replace(truth, associations=index.astype(int))
-
-
-def true_errors(header: Header, file: Path) -> dict[str, Array]:
-    """Known true errors by the field of `Truth`; each group is whole, and a truth has a calibration."""
-    stated = header.truth
-    return {
-        name: np.array(astuple(typed(stated, _TRUTH[name], file, "truth")))
-        for name, entries in TRUE_ERRORS.items()
-        if stated and (name == "calibration" or not stated.keys().isdisjoint(entries))
-    }
 
 
 def measured_noise(header: Header, file: Path) -> MeasuredNoise | None:

@@ -17,10 +17,10 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import move_points, rotation
 from pathspace_graph.labels import BOUNDARIES, LABELS, LEFT, NAMES, RIGHT
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.centre_line import Ribbon, find_line
+from pathspace_graph.spline.centre_line import find_line
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
-from .brief import Brief, pictures
+from .brief import Brief, Shown, pictures
 from .parsing import MAX_COORDINATE, MAX_DEGREE, read_json, shown, typed
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ class Boundaries(Mapping[Any, MapBoundary]):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Map:
+class Map(Shown):
     """Map of a track."""
 
     LENGTHS: ClassVar = {"boundaries": 0, "joint_covariance": 2, "points": 0}
@@ -370,42 +370,22 @@ def as_ribbon(track: Map, sigma_shape: float) -> Map:
     """Replace the boundaries of a map by the edges of its ribbon; SettingsError where none fits.
 
     `sigma_shape` (m) is what a ribbon cannot follow, one sigma, added to each control point of its edges.
+    Open edges are confirmed as far as their boundaries.
     """
-    ribbon, covariance, until = ribbon_of(track)
-    return replace(map_of_ribbon(ribbon, covariance, sigma_shape, until), points=track.points)
-
-
-def ribbon_of(track: Map) -> tuple[Ribbon, Array | None, dict[int, float]]:
-    """Fit the ribbon between the boundaries of a map; SettingsError where none fits.
-
-    With it come its covariance (3m, 3m), if known, and the parameter up to which each open edge is confirmed.
-    """
-    curves = {label: track.curve(label, "a centre line") for label in BOUNDARIES}
-    P = track.covariance_of(*curves.values())
-    left, right = (curve.spline for curve in curves.values())
-    line, until = find_line(left, right), {}
-    for side, (label, curve) in enumerate(curves.items()):
-        if not left.periodic:
-            end = np.array([min(curve.confirmed_until, curve.spline.domain[1])])
-            until[label] = float(line.ribbon_parameters(side, end)[0])
-    return line.ribbon, None if P is None else line.by_boundaries @ P @ line.by_boundaries.T, until
-
-
-def map_of_ribbon(
-    ribbon: Ribbon, covariance: Array | None, sigma_shape: float, until: dict[int, float]
-) -> Map:
-    """Build the map of the edges of a ribbon, with the covariance (3m, 3m) of its control points, if known.
-
-    `sigma_shape` (m) is added to each control point. Open edges are confirmed up to the parameters `until`.
-    """
-    edges, joint, at = {label: ribbon.edge_spline(label) for label in BOUNDARIES}, None, 0
-    if covariance is not None:
-        by_ribbon = np.concatenate([jacobian for _, jacobian in edges.values()])
-        joint = by_ribbon @ covariance @ by_ribbon.T
+    curves = left, right = track.curves("a centre line")
+    line, P = find_line(left.spline, right.spline), track.covariance_of(left, right)
+    edges, joint = [line.ribbon.edge(label) for label in BOUNDARIES], None
+    if P is not None:
+        change = np.concatenate([by_ribbon for _, by_ribbon in edges]) @ line.by_boundaries
+        joint = change @ P @ change.T
         joint = 0.5 * (joint + joint.T) + sigma_shape**2 * np.eye(len(joint))
-    boundaries = {}
-    for label, (spline, jacobian) in edges.items():
-        block = slice(at, at := at + len(jacobian))
+    boundaries, at = {}, 0
+    for side, (label, curve) in enumerate(zip(BOUNDARIES, curves, strict=True)):
+        edge, by_ribbon = edges[side]
+        block, until = slice(at, at := at + len(by_ribbon)), edge.domain[1]
+        if not edge.periodic:
+            end = np.array([min(curve.confirmed_until, curve.spline.domain[1])])
+            until = float(line.ribbon_parameters(side, end)[0])
         own = NO_COVARIANCE if joint is None else joint[block, block].copy()
-        boundaries[label] = SplineBoundary(spline, own, until.get(label, spline.domain[1]))
-    return Map(ribbon.periodic, boundaries, joint)
+        boundaries[label] = SplineBoundary(edge, own, until)
+    return Map(line.ribbon.periodic, boundaries, joint, track.points)

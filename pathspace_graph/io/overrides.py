@@ -3,13 +3,11 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
-
-import msgspec
+from typing import Any, TypeVar
 
 from pathspace_graph.errors import InputError, SettingsError, check_name
 from pathspace_graph.io.parsing import MAX_HEADER_BYTES, parse_json, parse_toml, read_text, shown
-from pathspace_graph.settings.checked import in_words
+from pathspace_graph.settings.checked import as_setting
 
 T = TypeVar("T")
 Overrides = Mapping[str, Any]  # new values by dotted field
@@ -67,20 +65,11 @@ def read_settings(file: Path, settings: T, estimators: Iterable[str] = ()) -> tu
 
 def _set(settings: Any, path: list[str], value: Any, where: str) -> Any:
     name, *rest = path
-    hint = get_type_hints(type(settings))[name]
-    new = _set(getattr(settings, name), rest, value, where) if rest else as_type(value, hint, where)
+    if rest:
+        new = _set(getattr(settings, name), rest, value, where)
+    else:  # JSON has infinity as a text
+        new = as_setting(float(value) if value in ("inf", "-inf") else value, type(settings), name, where)
     try:
         return replace(settings, **{name: new})
     except SettingsError as error:
         raise error if str(error).startswith(where) else SettingsError(f"{where}: {error}") from error
-
-
-def as_type(value: Any, hint: Any, where: str) -> Any:
-    """Convert a value of TOML or JSON to the type of a field, such as a list to a tuple."""
-    plain = value.tolist() if hasattr(value, "tolist") else value  # NumPy's numbers are numbers
-    if isinstance(plain, str) and plain in ("inf", "-inf"):  # JSON has these as texts
-        plain = float(plain)
-    try:
-        return msgspec.convert(plain, hint)
-    except (msgspec.ValidationError, OverflowError):
-        raise SettingsError(f"{where}: expected {in_words(hint)}, found {shown(value)}") from None

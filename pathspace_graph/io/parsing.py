@@ -27,15 +27,12 @@ MAX_DEPTH: Final = 32  # of lists and tables in each other
 MAX_VARIANTS: Final = 10_000  # of a study's grid
 
 MAX_STAMP: Final = 1e10  # s: 300 years; stamps in milliseconds or nanoseconds are beyond it
-MAX_SPEED: Final = 1e3  # m/s
-MAX_YAW_RATE: Final = 1e3  # rad/s
 MAX_HELD: Final = 1e3  # m, moved by a twist until the next row
 MAX_DRIVE: Final = 1e6  # m
 MAX_RANGE: Final = 1e4  # m, each coordinate of a detection
 MAX_DETECTIONS: Final = 10_000  # of one perception cycle
 MAX_COORDINATE: Final = 1e8  # m, of a map, a trajectory or a track; any geodetic grid has room in it
 MAX_DEGREE: Final = 20
-MAX_ANGLE: Final = 1e6  # rad, of a heading that was not wrapped
 MAX_NOISE: Final = 1e6  # a number in a log's header, in its own unit
 MAX_TRACK_LENGTH: Final = 3e4  # m; rows are matched in a time that grows with its square
 MAX_TRACK_WIDTH: Final = 100.0  # m, from the middle of a track to a boundary
@@ -78,8 +75,6 @@ def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) 
 # --- TOML, JSON and YAML -----------------------------------------------------------------------------------
 
 _YAML_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-# of the parsers; that of YAML raises most of them for values that do not fit their tags, as `2020-99-99`
-_ERRORS: Final = (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError)
 
 
 @contextmanager
@@ -92,7 +87,8 @@ def _parsing(file: Path, kind: str, text: str) -> Iterator[None]:
     except yaml.MarkedYAMLError as error:
         row = None if error.problem_mark is None else error.problem_mark.line + 1
         raise InputError(file, f"expected {kind}: {error.problem}", row) from None
-    except _ERRORS as error:
+    # YAML raises most of these for values that do not fit their tags, as `2020-99-99`
+    except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         told = " ".join(str(error).split())
         line, byte = re.search(r"at line (\d+)", told), re.search(r"\(byte (\d+)\)|truncated", told)
         row = int(line[1]) if line else None

@@ -19,7 +19,7 @@ from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
 from pathspace_graph.provenance import made
 
-from .brief import Brief, frames
+from .brief import Brief, Shown, frames, notebook
 from .files import atomic_folder, write_json, write_table
 from .map import MAP_FILE, Map, map_to_json
 
@@ -27,19 +27,20 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from .log import Truth
+
 TRAJECTORY_FILE: Final = "trajectory.tum"
 SMOOTHED_FILE: Final = "smoothed.tum"
-DRIVES_FOLDER: Final = "drives"  # of the folders of the drives, where several were mapped at once
 NoiseSource = Literal["stated", "measured", "assumed"]  # by the log, by the drive, by default
 
 
 def write_trajectory(file: Path, t: ArrayLike, poses: ArrayLike) -> None:
     """Write stamps (n,) in s and poses [x, y, theta] (n, 3), map frame; every number to full precision."""
-    rows = np.column_stack([np.asarray(t, dtype=float), np.asarray(poses, dtype=float).reshape(-1, 3)])
-    with file.open("w", encoding="utf-8", newline="\n") as out:
-        for stamp, x, y, theta in rows.tolist():
-            qz, qw = float(np.sin(theta / 2)), float(np.cos(theta / 2))
-            out.write(f"{stamp!r} {x!r} {y!r} 0.0 0.0 0.0 {qz!r} {qw!r}\n")
+    x, y, theta = np.asarray(poses, dtype=float).reshape(-1, 3).T
+    zero = np.zeros((len(x), 3))
+    write_table(
+        file, (), np.asarray(t, dtype=float), x, y, zero, np.sin(theta / 2), np.cos(theta / 2), delimiter=" "
+    )
 
 
 CYCLES_FILE: Final = "cycles.csv"
@@ -155,7 +156,7 @@ class RunNoise:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RunResult:
+class RunResult(Shown):
     """Result of an estimator's run over a log."""
 
     LENGTHS: ClassVar = {
@@ -208,6 +209,11 @@ class RunResult:
         frame: pd.DataFrame = frames().run_frame(self)
         return frame
 
+    def metrics(self, truth: Truth) -> pd.DataFrame:
+        """Measure each complete lap against the truth of its log: the columns of `ablate`, by lap."""
+        frame: pd.DataFrame = notebook().metrics(self, truth)
+        return frame
+
     def plot(self, **options: Any) -> Figure:
         """Draw map and trajectory; the options are those of `Map.plot`."""
         health = [record.health for record in self.cycles]
@@ -250,7 +256,7 @@ def write_result(
         write_json(temporary / MAP_FILE, map_to_json(result.map), indent=None)
         _write_drive(temporary, result)
         for name, drive in (drives or {}).items():
-            own = temporary / DRIVES_FOLDER / name
+            own = temporary / "drives" / name
             own.mkdir(parents=True)
             _write_drive(own, drive)
         write_json(temporary / "summary.json", {**summary, "made": made()})

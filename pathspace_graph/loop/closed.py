@@ -25,7 +25,7 @@ class Closed(Phase):
         self.known_loop = KnownLoop()
         self._boundaries_cross = _crosses(road, drive)
         self._settled = road.path.length  # path length at the last replacement of the map (m)
-        road.growth.clear()
+        road.growth.tentative.clear()
 
     def judge(
         self, road: Road, drive: Drive, classified: Classified, reading: Reading
@@ -38,11 +38,11 @@ class Closed(Phase):
             health = Health(DEGRADED, "the two boundaries of the map cross")
         if is_whole and drive.can_repair:
             loop = self.known_loop.of(smoother)
-            self.map_repair.contradictions.observe(smoother.map, loop, classified.new, reading.detections.t)
+            self.map_repair.observe(smoother.map, loop, classified.new, reading.detections.t)
         if health.condition != LOST or not is_whole or drive.solver.is_busy:
             return self, health
         smoother.map.detections.release_all()  # they must not change the map
-        self.map_repair.contradictions.clear()
+        self.map_repair.tracks.clear()
         drive.record.give_up("the vehicle was lost")
         return Lost(self, road, health), health
 

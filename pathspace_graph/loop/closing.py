@@ -1,5 +1,6 @@
 """What replaces the map of an open road: the marginal of the lap's batch, or a known map; and its gauge."""
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -11,10 +12,10 @@ from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import compose, inverse, left_of, move_points, relative
 from pathspace_graph.graph.smoother import exchange_calibration_priors, hold_motion, restart, set_prior
-from pathspace_graph.graph.variables import NO_KEYS, control_keys, pose_keys
+from pathspace_graph.graph.variables import control_keys, pose_keys
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
-from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.state import GivenFactor, State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary, open_boundary
 
@@ -30,40 +31,45 @@ SIGMA_STEP: Final = 10.0  # damping of control points while the loop is optimize
 # --- the marginal of a batch -----------------------------------------------------------------------------
 
 
-def swap_in(road: Road, marginal: LapMarginal) -> Array:
+def swap_in(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor] = ()) -> Array:
     """Replace curves and prior by the marginal of a lap; return the jump (3,) of the newest pose.
 
     The window keeps its own factors of the poses from `first_kept` on, and the marginal has those of all
-    earlier poses, so nothing is counted twice. The marginal includes the priors of spacing and shape.
+    earlier poses, so nothing is counted twice. The marginal includes the priors of spacing and shape. Of the
+    factors that the user has `given`, later ones on former control points go on as rows.
     """
     smoother, state = road.smoother, road.smoother.map.state
-    smoother.reactivate(with_prior=False)
+    restart(smoother, marginal.first_kept)
+    smoother.user_factors.drop([one.factor for one in given if one.cycle < marginal.first_kept or one.points])
     before, removed = state.poses[-1].copy(), state.map_keys
     settings = road.settings.spline, road.settings.gauge
     for label, spline in marginal.splines.items():  # a batch may have found a side that the road has not
         boundary = state.boundaries.get(label, open_boundary(*settings))
         state.close(label, boundary.closed(spline.knots))
-    added = np.concatenate([state.keys(label) for label in marginal.splines])
+    added = np.concatenate([state.control_keys(label) for label in marginal.splines])
     points = np.concatenate([spline.distinct_control_points for spline in marginal.splines.values()])
-    restart(smoother, marginal.first_kept, removed, added, points)
+    smoother.variables.remove(removed)
+    smoother.variables.insert(added, points.ravel())
     smoother.map.replaced_by(marginal.scatter, marginal.cones, marginal.stations)
     _move_poses(state.poses, marginal.poses[marginal.first_kept :])
     locate_poses(state)
     _take_prior(smoother, marginal, added)
+    later = [one for one in given if one.cycle >= marginal.first_kept and one.points]
+    smoother.add_to_prior([rows for one in later for rows in one.on(state)])
     smoother.reassociate()
     return _jump(road, before)
 
 
-def lay_on(road: Road, marginal: LapMarginal) -> Array:
+def lay_on(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor] = ()) -> Array:
     """Move an open map to the marginal of its batch, the new prior; return the jump (3,) of the newest pose.
 
     The curves keep their knots and go on to grow. What came after the batch's last pose moves rigidly with
     it: poses, tentative cones, and the newest ends of the curves.
     """
     smoother, state = road.smoother, road.smoother.map.state
-    smoother.reactivate(with_prior=False)
+    restart(smoother, marginal.first_kept)
+    smoother.user_factors.drop([one.factor for one in given if one.cycle < marginal.first_kept])
     before = state.poses[-1].copy()
-    restart(smoother, marginal.first_kept, NO_KEYS, NO_KEYS, np.zeros((0, 2)))
     _move_poses(state.poses, marginal.poses[marginal.first_kept :])
     motion = compose(state.poses[-1], inverse(before))
     road.move(motion)
@@ -74,7 +80,7 @@ def lay_on(road: Road, marginal: LapMarginal) -> Array:
             placed = boundary.settled(spline.size, boundary.last_cone(end))
         control_points[placed:] = move_points(motion, control_points[placed:])
         control_points[:placed] = spline.control_points[:placed]
-    known = [state.keys(label)[: spline.size] for label, spline in marginal.splines.items()]
+    known = [state.control_keys(label)[: spline.size] for label, spline in marginal.splines.items()]
     _take_prior(smoother, marginal, np.concatenate(known))
     exchange_calibration_priors(smoother, marginal.calibration_prior)
     return _jump(road, before)
@@ -115,15 +121,17 @@ def lay_on_known(road: Road, known: KnownMap, motion: Array, covariance: Array) 
     smoother, state = road.smoother, road.smoother.map.state
     variables = state.variables
     sigmas = np.array(SIGMAS_CALIBRATIONS)[: len(variables.calibrations)]
-    smoother.reactivate(with_prior=False)
+    restart(smoother, smoother.first_cycle)
     before, removed = state.poses[-1].copy(), state.map_keys
+    smoother.user_factors.remove(removed, variables)
     road.move(motion)
     road.growth.wait_for({} if known.closed else known.ends)
     curves = {label: _next(state.boundaries, known, label, road.settings) for label in known.splines}
     state.replace_curves(curves)
     added = np.concatenate([control_keys(label, b.numbers) for label, b in state.boundaries.items()])
     points = np.concatenate([spline.distinct_control_points for spline in known.splines.values()])
-    restart(smoother, smoother.first_cycle, removed, added, points)
+    variables.remove(removed)
+    variables.insert(added, points.ravel())
     known.place_cones(smoother.map)
     state.poses[:] = compose(motion, state.poses)
     locate_poses(state)

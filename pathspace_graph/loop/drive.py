@@ -7,6 +7,7 @@ from itertools import chain as chain_of
 from math import nan
 from typing import ClassVar, Final, Generic, TypeVar
 
+import gtsam
 import numpy as np
 
 from pathspace_graph.batch.known_map import KnownMap
@@ -14,17 +15,19 @@ from pathspace_graph.batch.lap import LapMarginal, OpenLap
 from pathspace_graph.batch.start import StartMap, unwrap
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, IntArray, read_only
-from pathspace_graph.factors.se2 import compose, inverse
+from pathspace_graph.factors.linear import keys_of_factor
+from pathspace_graph.factors.se2 import compose, inverse, path_lengths, relative
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.log_odometry import chained
 from pathspace_graph.front_end.noise import NoiseLearner
-from pathspace_graph.graph.rows import Revisit, Rows
+from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.health import Health, HealthMonitor
 from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.motion import MeasuredMotion, inflate_priors
 from pathspace_graph.mapping.road import Classified, Road
+from pathspace_graph.mapping.state import GivenFactor
 from pathspace_graph.places.passes import SeenIn
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -61,6 +64,9 @@ class CycleList(Copyable, Generic[T]):
             self._blocks, self._newest = (*self._blocks, self._newest), []
 
 
+MOST_CYCLES: Final = 20000  # most cycles of an open lap that is solved as a batch; a longer one stays open
+
+
 @dataclass(frozen=True, eq=False)
 class MeasuredCycle:
     """Measurements of a cycle."""
@@ -73,19 +79,19 @@ class MeasuredCycle:
 class DriveRecord(Copyable):
     """Odometry, detections and poses of every cycle, as long as a batch can solve them."""
 
-    def __init__(self, settings: MapperSettings) -> None:
-        self.settings = settings
+    def __init__(self) -> None:
         self.unsolvable: str | None = None  # reason why no batch can solve the drive, if there is one
         self.poses: Array = np.zeros((0, 3))  # (P, 3) online poses, or those of the newest batch; map frame
         self.corrected: Array = self.poses  # (k, 3) poses of the first k cycles after the last correction
+        self.reckoned: Array = self.poses  # (P, 3) by the motion of each cycle as it was estimated then
         self.stamps: CycleList[float] = CycleList()  # stamp of each cycle (s)
         self._measured: CycleList[MeasuredCycle] = CycleList()
-        self._factors: tuple[Rows, ...] = ()  # user factors on poses, at values of zero
+        self.factors: tuple[GivenFactor, ...] = ()  # the user's factors
 
     def give_up(self, reason: str) -> None:
         """Drop the measurements, as no batch can solve them; the first reason is kept."""
         self.unsolvable = self.unsolvable or reason
-        self._measured, self._factors = CycleList(), ()
+        self._measured, self.factors = CycleList(), ()
 
     def measured(self, reading: Reading) -> None:
         """Add the motion and the detections of a cycle."""
@@ -93,24 +99,49 @@ class DriveRecord(Copyable):
         if self.unsolvable is not None:
             return
         self._measured.append(MeasuredCycle(reading.motion, *reading.stated))
-        if len(self.stamps) > self.settings.open_lap.max_cycles:
+        if len(self.stamps) > MOST_CYCLES:
             self.give_up("the lap is too long for a batch")
 
-    def given(self, rows: Sequence[Rows] | None) -> None:
-        """Add user factors on poses, as rows at values of zero; None for factors that no batch can have."""
-        if rows is None and self.unsolvable is None:
-            self.give_up("the user's factors hold control points, and a batch has other ones")
-        elif rows and self.unsolvable is None:
-            self._factors = (*self._factors, *rows)
+    def given(self, factors: Sequence[gtsam.NonlinearFactor], road: Road) -> None:
+        """Add user factors of the newest cycle."""
+        if factors and self.unsolvable is None:
+            state, cycle = road.smoother.map.state, road.next_cycle - 1
+            self.factors = (*self.factors, *(GivenFactor.of(one, state, cycle) for one in factors))
+
+    def linearize(self, road: Road) -> None:
+        """Linearize the user factors on control points again that the road still has."""
+        state = road.smoother.map.state
+        known = set(state.variables.keys.tolist())
+        self.factors = tuple(
+            GivenFactor.of(one.factor, state, one.cycle)
+            if one.points and known.issuperset(keys_of_factor(one.factor).tolist())
+            else one
+            for one in self.factors
+        )
 
     def estimated(self, road: Road) -> None:
         """Add the newest pose, unless the loop has closed and no batch needs it."""
         if not road.closed or self.unsolvable is None:
             self.poses = read_only(np.concatenate([self.poses, road.poses[-1:]]))
+            pose = road.poses[-1]
+            if len(self.reckoned) and len(road.poses) > 1:
+                pose = compose(self.reckoned[-1], relative(road.poses[-2], pose))
+            self.reckoned = read_only(np.concatenate([self.reckoned, pose[None]]))
 
     def with_window(self, road: Road) -> Array:
         """Return the poses (P, 3) of all cycles, with the present ones of the window."""
         return unwrap(np.concatenate([self.poses[: road.smoother.first_cycle], road.poses]))
+
+    def with_newest_path(self, road: Road, length: float) -> Array:
+        """Return `with_window` where the newest path of a length (m) has kept its shape.
+
+        An update may turn the window by more than cones tell apart, and poses before it are older.
+        """
+        poses, stations = self.with_window(road), path_lengths(self.reckoned)
+        newest = stations > stations[-1] - length
+        frame = compose(poses[-1], inverse(self.reckoned[-1]))
+        poses[newest] = compose(frame, self.reckoned[newest])
+        return unwrap(poses)
 
     def replaced(self, poses: Array) -> None:
         """Replace the poses (P, 3) of all cycles."""
@@ -145,7 +176,8 @@ class DriveRecord(Copyable):
         motions = noise.motions_of_lap([one.motion for one in cycles])
         chain = chained([*self.stamps], motions, settings.odometry)
         table = DetectionTable.of([one.seen for one in cycles], twists=chain.twists)
-        return OpenLap(settings, chain, _for_map(table, noise), first_kept, start, revisits, self._factors)
+        factors = tuple(one for one in self.factors if one.cycle < first_kept)
+        return OpenLap(settings, chain, _for_map(table, noise), first_kept, start, revisits, factors)
 
 
 def _for_map(table: C, noise: NoiseLearner) -> C:
@@ -169,7 +201,7 @@ class Drive(Copyable):
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
         self.priors = settings  # settings with the present priors of the calibrations
-        self.record = DriveRecord(settings)
+        self.record = DriveRecord()
         self.solver = LapSolver(settings)
         self.monitor = HealthMonitor()
         self.revisits: tuple[Revisit, ...] = ()
@@ -212,6 +244,7 @@ class Drive(Copyable):
         self, road: Road, reading: Reading, start: StartMap | None, revisits: tuple[Revisit, ...]
     ) -> None:
         """Start a batch of the drive with its revisits, from a map or from odometry."""
+        self.record.linearize(road)
         window = road.smoother.first_cycle, road.next_cycle - 1
         lap = partial(
             self.record.lap, start=start, revisits=revisits, settings=self.priors, noise=reading.noise
@@ -230,17 +263,18 @@ class Drive(Copyable):
 
     def swap_in(self, road: Road, solved: LapMarginal) -> Array:
         """Replace map and prior of a road by those of a lap; return the jump (3,) of the newest pose."""
-        return self._replaced(road, solved, swap_in(road, solved))
+        self.record.linearize(road)
+        return self._replaced(road, solved, swap_in(road, solved, self.record.factors))
 
     def lay_on(self, road: Road, solved: LapMarginal, revisit: Revisit) -> Array:
         """Move an open map to the batch of a revisit; return the jump (3,) of the newest pose."""
         self.revisits = (*self.revisits, revisit)
-        return self._replaced(road, solved, lay_on(road, solved))
+        return self._replaced(road, solved, lay_on(road, solved, self.record.factors))
 
     def _replaced(self, road: Road, solved: LapMarginal, jump: Array) -> Array:
         self.lap_seconds = solved.seconds
         self.record.replaced(np.concatenate([solved.poses[: solved.first_kept], road.poses]))
-        road.place_orange(self.record.corrected)
+        road.orange.place(0, self.record.corrected)
         return jump
 
     def lay_on_known(self, road: Road, known: KnownMap, pose: Array, covariance: Array) -> Array:
@@ -252,7 +286,7 @@ class Drive(Copyable):
         self.record.replaced(np.concatenate([earlier, road.poses]))
         self.record.give_up(KNOWN)
         self.placed_at, self.keeps_map = road.smoother.times[-1], known.kept
-        road.place_orange(self.record.corrected)
+        road.orange.place(0, self.record.corrected)
         self.monitor.restart()
         return jump
 

@@ -10,10 +10,11 @@ from pathspace_graph.batch.lap import LapMarginal, OpenLap
 from pathspace_graph.copies import Copyable
 from pathspace_graph.settings.mapper import MapperSettings
 
-from . import worker
 from .worker import BATCH_LATE, LapBatch, Unsolved
 
 LONGEST_WAIT: Final = 1.0  # longest wait of a cycle for a batch (s)
+MOST_LATE: Final = 100  # most cycles by which a batch may be late, after which it is abandoned
+CYCLES_SHARE: Final = 0.03  # of a long lap's cycles, after which its result is due, where these are more
 
 Outcome = LapMarginal | Unsolved
 
@@ -27,7 +28,6 @@ class LapSolver(Copyable):
         self._max_poses = settings.max_poses
         self._batch: LapBatch | None = None
         self._ends: tuple[int, ...] = ()
-        self._prepared = False
 
     @property
     def is_busy(self) -> bool:
@@ -46,13 +46,7 @@ class LapSolver(Copyable):
             return ends
         return (*ends, batch.last + 1)
 
-    # --- the process -------------------------------------------------------------------------------------
-
-    def prepare(self) -> None:
-        """Start the process once, so that it is ready when a lap is complete."""
-        if not self._prepared:
-            self._prepared = True
-            worker.submit(worker.nothing)
+    # --- the batch ---------------------------------------------------------------------------------------
 
     def begin(self, lap: Callable[[int], OpenLap], window: tuple[int, int], t: float) -> None:
         """Send a lap, built for its first kept cycle, at t (s) in the newest cycle of the window.
@@ -60,9 +54,9 @@ class LapSolver(Copyable):
         The result is due some cycles later; in a replay, in the recorded cycle.
         """
         settings, (first, cycle) = self._settings, window
-        wait = max(min(settings.cycles, cycle - first), int(settings.cycles_share * cycle))
+        wait = max(min(settings.cycles, cycle - first), int(CYCLES_SHARE * cycle))
         first_kept, due = min(first + wait, cycle), cycle + wait
-        last = max(due, min(due + settings.late, first_kept + self._max_poses - 1))
+        last = max(due, min(due + MOST_LATE, first_kept + self._max_poses - 1))
         recorded = settings.ends[len(self._ends) :][:1]
         due = min(max([due, *recorded]), last + 1)
         self._batch = LapBatch(lap(first_kept), t, due, last)

@@ -11,7 +11,7 @@ import numpy as np
 
 from pathspace_graph.batch.association import locate_poses
 from pathspace_graph.copies import Copyable
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import compose, difference, inverse, path_lengths
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.smoother import forget_poses
@@ -20,15 +20,14 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.mapping.smoother import CurveSmoother
-from pathspace_graph.places.constellation import Constellation, Prior
-from pathspace_graph.places.find import KnownRoad, Place, find, sure
+from pathspace_graph.places.constellation import Prior
+from pathspace_graph.places.find import KnownRoad, Place, sure
+from pathspace_graph.places.passes import STRETCH, place_on
 
 from .drive import Drive, Phase, Step
 
 FOUND: Final = "the vehicle was lost, and is found again"  # notice of a relocalization
 SEARCH_INTERVAL: Final = 0.5  # least time between two attempts (s)
-SEARCH_MEMORY: Final = 60.0  # length of the newest path in use (m)
-SEARCH_CONES: Final = 30.0  # length of the newest path whose cones are in use; of lines, all of it (m)
 LEAST_PATH: Final = 20.0  # least length of the path without a given start (m)
 AT_START: Final = (1.0, 1.0, 0.2), (4.0, 0.5)  # sigmas and reach of a given start (m, m, rad)
 WIDENING: Final = 3.0  # inflation of the sigmas of a place: its detections are used again
@@ -57,7 +56,7 @@ class Search(Copyable):
         self._poses.append(pose.copy())
         self._seen.append(detections)
         driven = path_lengths(np.array(self._poses))
-        old = int(driven.searchsorted(driven[-1] - SEARCH_MEMORY))
+        old = int(driven.searchsorted(driven[-1] - STRETCH))
         del self._poses[:old], self._seen[:old]
 
     def find(self) -> Place | None:
@@ -66,19 +65,15 @@ class Search(Copyable):
             return None
         self._tried = self._seen[-1].t
         poses = np.array(self._poses)
-        driven = path_lengths(poses)
+        prior = None
         if self.start is not None:
             prior = Prior.about(compose(self.start, poses[-1]), *AT_START)
-        elif driven[-1] < LEAST_PATH:
+        elif path_lengths(poses)[-1] < LEAST_PATH:
             return None
-        else:
-            prior = self.known.along(poses)
-        of_lines = self.settings.of_lines
-        length = SEARCH_MEMORY if of_lines else SEARCH_CONES
-        first = int(driven.searchsorted(driven[-1] - length))
-        table = DetectionColumns.of(self._seen[first:], first)
-        seen = Constellation.of(table, poses, self.settings.growth, of_lines=of_lines).seen_from(poses[-1])
-        return sure(find(seen, self.known.seen, prior))
+        return sure(place_on(self.known, self._seen_in, poses, self.settings, prior))
+
+    def _seen_in(self, cycles: IntArray) -> DetectionColumns:
+        return DetectionColumns.of(self._seen[cycles[0] :], int(cycles[0]))
 
 
 class Lost(Phase):

@@ -5,28 +5,27 @@ boundary and the adjacent stretches still determine the poses. So the batch of t
 these poses, with curves through the contradicting cones.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from pathspace_graph.batch.lap import LapMarginal
 from pathspace_graph.batch.simplification import fit_through
 from pathspace_graph.batch.start import StartMap
 from pathspace_graph.copies import Copyable
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
+from pathspace_graph.front_end.cone_rows import ROW_GAP
 from pathspace_graph.graph.smoother import place_again
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import SAMPLE
-from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label
+from pathspace_graph.mapping.tracks import Tracks, linked
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import GrowthSettings
 from pathspace_graph.spline.boundary import ahead_of, sampled
 from pathspace_graph.spline.bspline import BSpline
 
@@ -39,8 +38,6 @@ REPAIR_MEMORY: Final = 30.0  # time without a detection after which a contradict
 CONES: Final = 3  # least number of contradictions of a repaired stretch
 REPAIR_BESIDE: Final = 0.5  # distance from a curve within which a cone does not contradict it (m)
 CERTAIN: Final = 1.0  # largest sigma of a detection that may contradict the map (m)
-ROW: Final = 11.0  # largest distance of neighbours in a row (m): two regular gaps, as a cone may be missed
-ROW_ALONG: Final = 2.0 * ROW  # the same along the drive (m), which is longer on the inner side of a bend
 SETTLE: Final = 1.5  # time without detections after which a cone counts as passed (s)
 MOST: Final = 20  # number of passed contradictions from which a stretch is repaired before its end
 REPAIR_INTERVAL: Final = 1.0  # time between searches for contradictions (s)
@@ -59,12 +56,18 @@ class ContradictedStretch:
     cones: Array  # (k, 2) positions in m, map frame, unordered
 
 
-class Contradictions(Copyable):
-    """Tentative tracks, by label, of the detections that no curve of a closed map explains."""
+class MapRepair(Copyable):
+    """The cones that contradict a closed map, and attempts to repair it."""
 
-    def __init__(self, settings: GrowthSettings) -> None:
-        merging = replace(settings, sightings=SIGHTINGS, forget_after=REPAIR_MEMORY)
-        self._tracks = {label: TentativeTracks(merging) for label in BOUNDARIES}
+    def __init__(self, settings: MapperSettings) -> None:
+        self.tracks = Tracks(settings.growth.merge_radius, REPAIR_MEMORY)
+        """Cones that no curve of the map explains."""
+        self._stretches: list[ContradictedStretch] = []
+        self._lap: Array = np.zeros((0, 3))  # poses of the newest lap at the start of the attempt
+        self._mapped = dict[int, Array]()  # cones (k, 2) on each curve at the start of the attempt
+        self._asked = -np.inf
+        self._wait_until = 0.0
+        self._attempts = 0
 
     def observe(self, track: CurveMap, loop: Loop, new: slice, t: float) -> None:
         """Add the new coloured detections at t (s) that are unused, or used in a gap of their curve."""
@@ -80,21 +83,16 @@ class Contradictions(Copyable):
             certain = np.linalg.eigvalsh(covariances)[:, -1] < CERTAIN**2
             rows, covariances = rows[certain], covariances[certain]
             points = detections.points_map(rows, track.variables)
-            add_by_label(self._tracks, detections.label[rows], points, covariances, t)
-
-    def clear(self) -> None:
-        """Forget all tracks, since map or pose was replaced."""
-        for tracks in self._tracks.values():
-            tracks.clear()
+            self.tracks.add(points, covariances, detections.label[rows], t)
 
     def stretches(self, loop: Loop, t: float) -> list[ContradictedStretch]:
         """Return the stretches whose cones contradict the loop or are in a gap, once all cones are passed.
 
         A long stretch is complete with `MOST` passed cones.
         """
-        found = list[ContradictedStretch]()
-        for label, tracks in self._tracks.items():
-            chosen = tracks.confirmed()
+        found, tracks = list[ContradictedStretch](), self.tracks
+        for label in BOUNDARIES:
+            chosen = tracks.confirmed(label, SIGHTINGS)
             if len(chosen) < CONES:
                 continue
             away = {
@@ -102,49 +100,22 @@ class Contradictions(Copyable):
             }
             in_gap = loop.beside_gaps(np.full(len(chosen), label), tracks.points[chosen])
             chosen = chosen[(away[label] | in_gap) & away[LEFT + RIGHT - label]]
-            chosen = chosen[self._undisputed(label, chosen)]
+            chosen = chosen[tracks.undisputed(chosen, label)]
             if len(chosen) < CONES:
                 continue
             points, passed = tracks.points[chosen], tracks.last_t[chosen] < t - SETTLE
-            for row in (row for row in in_rows(points, ROW) if len(row) >= CONES):
+            for row in (row for row in linked(points, ROW_GAP) if len(row) >= CONES):
                 if not passed[row].all() and passed[row].sum() < MOST:
                     return []
                 found.append(ContradictedStretch(label, points[row[passed[row]]]))
         return found
-
-    def _undisputed(self, label: int, chosen: IntArray) -> BoolArray:
-        """Whether the `chosen` tracks (k,) have more detections than those of the other colour there."""
-        tracks, other = self._tracks[label], self._tracks[LEFT + RIGHT - label]
-        apart = np.hypot(*(tracks.points[chosen, None] - other.points).transpose(2, 0, 1))
-        rival = np.where(apart < other.settings.merge_radius, other.counts, 0).max(axis=1, initial=0)
-        return np.asarray(tracks.counts[chosen] > rival)
-
-
-def in_rows(points: Array, apart: float) -> list[IntArray]:
-    """Group points (n, 2) by single linkage at distances up to `apart` (m); return indices (k,) by group."""
-    pairs = KDTree(points).sparse_distance_matrix(KDTree(points), apart)
-    count, group = connected_components(pairs, directed=False)
-    return [np.flatnonzero(group == number) for number in range(count)]
-
-
-class MapRepair(Copyable):
-    """Attempts to repair a closed map."""
-
-    def __init__(self, settings: MapperSettings) -> None:
-        self.contradictions = Contradictions(settings.growth)
-        self._stretches: list[ContradictedStretch] = []
-        self._lap: Array = np.zeros((0, 3))  # poses of the newest lap at the start of the attempt
-        self._mapped = dict[int, Array]()  # cones (k, 2) on each curve at the start of the attempt
-        self._asked = -np.inf
-        self._wait_until = 0.0
-        self._attempts = 0
 
     def is_due(self, known: KnownLoop, smoother: CurveSmoother, t: float, driven: float) -> bool:
         """Whether a repair is due at t (s), after a path of length `driven` (m)."""
         if t < self._asked + REPAIR_INTERVAL or driven < self._wait_until or self._attempts >= REPAIRS:
             return False
         loop, self._asked = known.of(smoother), t
-        self._stretches = self.contradictions.stretches(loop, t)
+        self._stretches = self.stretches(loop, t)
         if self._stretches:
             longest = max(boundary.length for boundary in smoother.map.state.boundaries.values())
             self._attempts, self._wait_until = self._attempts + 1, driven + longest
@@ -169,7 +140,7 @@ class MapRepair(Copyable):
         stretches, self._stretches = self._stretches, []
         smoother.refresh()
         replaced = [stretch for stretch in stretches if replace_stretch(smoother, stretch)]
-        self.contradictions.clear()
+        self.tracks.clear()
         if not replaced:
             return ""
         smoother.reassociate()
@@ -201,7 +172,7 @@ class MapRepair(Copyable):
         if sum(explained) < max(EXPLAINED * sum(len(stretch.cones) for stretch in stretches), lost):
             return ""
         self._wait_until = 0.0
-        self.contradictions.clear()
+        self.tracks.clear()
         names = [NAMES[label] for label in BOUNDARIES if explained[label]]
         return f"{REPAIRED}: {sum(explained)} more cones on the {' and on the '.join(names)} lie on it"
 
@@ -216,7 +187,7 @@ def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> bo
     u = boundary.find_anywhere(points, cones).u
     middle = np.angle(np.exp(2j * np.pi * u / boundary.length).mean()) * boundary.length / (2.0 * np.pi)
     within = ahead_of(middle, u, boundary.length)
-    low, high = within.min() - ROW, within.max() + ROW
+    low, high = within.min() - ROW_GAP, within.max() + ROW_GAP
 
     def is_there(at: Array) -> BoolArray:
         beyond = ahead_of(middle, at, boundary.length)
@@ -233,7 +204,7 @@ def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> bo
     left = np.hypot(*(off[: len(u)] - basis[: len(u)] @ change).T)
     if np.count_nonzero(left < REPAIR_BESIDE) < EXPLAINED * len(u):
         return False
-    place_again(smoother, state.keys(label)[moved], points[moved] + change, REPLACED)
+    place_again(smoother, state.control_keys(label)[moved], points[moved] + change, REPLACED)
     smoother.map.forget_cones(label, is_there)
     return True
 
@@ -262,7 +233,7 @@ def refitted(track: CurveMap, label: int, stretches: list[ContradictedStretch], 
         cones, at = np.concatenate([cones[kept], stretch.cones]), np.append(at[kept], new_at)
     if len(cones) < settings.spline.min_size:
         return state.spline(label)
-    return fit_through(cones[np.argsort(at)], True, settings, settings.batch.dense_share)
+    return fit_through(cones[np.argsort(at)], True, settings, settings.batch.dense_share)[0]
 
 
 def mapped_cones(track: CurveMap, label: int) -> Array:
@@ -296,6 +267,8 @@ def _is_replaced(cones: Array, at: Array, row: Array, row_at: Array, settings: M
     away = np.abs(along_and_across(cones, row[order], row_at[order])[1])
     ends = np.sort(np.concatenate([[-np.inf], row_at - beside, row_at + beside, [np.inf]]))
     after = ends.searchsorted(at)
-    within = ends[after] - ends[after - 1] < ROW_ALONG
+    within = (
+        ends[after] - ends[after - 1] < 2.0 * ROW_GAP
+    )  # along the drive: less on the inner side of a bend
     same = KDTree(row).query(cones)[0] < settings.growth.merge_radius
     return np.asarray(same | (within & (away > beside)))

@@ -7,7 +7,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from pathspace_graph.batch.association import LINE_STEP
-from pathspace_graph.batch.start import REVISIT_INTERVAL, StartMap, unwrap
+from pathspace_graph.batch.start import REVISIT_INTERVAL, StartMap
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import path_lengths, to_vehicle
@@ -17,7 +17,13 @@ from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.mapping.path import HEADING
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.places.constellation import Prior, SampledCurves
-from pathspace_graph.places.passes import NEARBY, newest_place, return_to_beginning, revisit_of
+from pathspace_graph.places.passes import (
+    NEARBY,
+    NEWEST_PATHS,
+    newest_place,
+    return_to_beginning,
+    revisit_of,
+)
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .closed import Closed
@@ -28,6 +34,11 @@ from .worker import Unsolved
 STAYS_OPEN: Final = "the loop stays open"  # beginning of the notice without a batch that agrees
 REVISITED: Final = "the road was driven before: the open map was optimized with the earlier pass"
 """Notice of the first cycle with a revisit."""
+MOST_CONES: Final = 4000  # most cones of a lap that is solved as a batch: with more it would not be in time
+MOST_LAID_ON: Final = (
+    300  # most control points of an open map that a batch replaces: a cycle takes their cube
+)
+TOO_LONG: Final = "the open road is too long"
 NOT_REVISITED: Final = "an earlier pass of the road is not used"  # beginning of the notice of a failed batch
 
 
@@ -53,49 +64,38 @@ class Open(Phase):
         return replace(step, notice="; ".join(filter(None, [step.notice, learned])))
 
     def _step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
-        if not drive.solver.is_busy:
-            if not self._is_solvable(road, drive):
-                return self._stay_open(drive)
-            self._begin_batch(road, drive, reading)
-        if not drive.solver.is_busy:
-            return Step(self)
-        outcome = drive.outcome(road, spent)
-        return Step(self) if outcome is None else self.take(road, drive, outcome)
-
-    def _begin_batch(self, road: Road, drive: Drive, reading: Reading) -> None:
-        """Start a batch if the newest detections match those of the beginning, or of another earlier pass.
+        """Start a batch where the newest detections match an earlier pass; take its result once it is due.
 
         The map stays as it is until the batch confirms the match.
         """
-        revisit, record, noise = None, drive.record, reading.noise
-        if road.path.length > self.settings.closing.min_path:
-            drive.solver.prepare()
-            revisit = self.returns.find(road, record, noise)
-        self._closes, start = revisit is not None, None
-        if revisit is None:
-            revisit = self.revisits.find(road, record, noise)
+        if not drive.solver.is_busy:
+            cones = sum(  # or equivalent places on a line
+                boundary.length / LINE_STEP if self.settings.of_lines else len(boundary.cone_parameters)
+                for boundary in road.boundaries.values()
+            )
+            if cones > MOST_CONES:
+                drive.record.give_up("the lap has too many cones for a batch")
+            if drive.record.unsolvable is not None:
+                said, self._said = self._said, True  # only the first notice says why
+                return Step(self, notice="" if said else f"{STAYS_OPEN}: {drive.record.unsolvable}")
+            revisit, record, noise = None, drive.record, reading.noise
+            if road.path.length > self.settings.closing.min_path:
+                revisit = self.returns.find(road, record, noise)
+            self._closes = revisit is not None
+            if self._closes:
+                self.returns.rest(road, self.settings.open_lap.retry)
+            else:
+                revisit = self.revisits.find(road, record, noise)
             if revisit is None:
-                return
-            start = open_map(road, record.with_window(road))
-        else:
-            self.returns.rest(road, self.settings.open_lap.retry)
-        self.asked_by, self._taken_back = revisit, road.growth.taken_back
-        drive.begin_batch(road, reading, start, (revisit, *drive.revisits))
-
-    def _is_solvable(self, road: Road, drive: Drive) -> bool:
-        """Whether a batch can solve the lap; one with too many cones is given up."""
-        cones = sum(  # or equivalent places on a line
-            boundary.length / LINE_STEP if self.settings.of_lines else len(boundary.cone_parameters)
-            for boundary in road.boundaries.values()
-        )
-        if cones > self.settings.open_lap.max_cones:
-            drive.record.give_up("the lap has too many cones for a batch")
-        return drive.record.unsolvable is None
-
-    def _stay_open(self, drive: Drive) -> Step:
-        """Continue without a batch; the first notice says why."""
-        said, self._said = self._said, True
-        return Step(self, notice="" if said else f"{STAYS_OPEN}: {drive.record.unsolvable}")
+                return Step(self)
+            if not self._closes and sum(one.size for one in road.boundaries.values()) > MOST_LAID_ON:
+                said, self._said = self._said, True
+                return Step(self, notice="" if said else f"{NOT_REVISITED}: {TOO_LONG}")
+            self.asked_by, self._taken_back = revisit, road.growth.taken_back
+            start = None if self._closes else open_map(road, record.with_window(road))
+            drive.begin_batch(road, reading, start, (revisit, *drive.revisits))
+        outcome = drive.outcome(road, spent)
+        return Step(self) if outcome is None else self.take(road, drive, outcome)
 
     # --- results -----------------------------------------------------------------------------------------
 
@@ -151,19 +151,19 @@ class ReturnFinder(Copyable):
         length, cycle, closing = road.path.length, road.next_cycle, self._settings.closing
         tried, tried_cycle = self._tried
         waited = length >= tried + closing.check_interval or cycle >= tried_cycle + RETURN_CYCLES
-        if length < self._rests_until or not waited or not road.path.near_beginning(road.poses[-1], closing):
+        if length < self._rests_until or not waited:
             return None
         self._tried = length, cycle
         curves, smoother = None, road.smoother
         if self._settings.of_lines:
-            if not road.boundaries:
+            if not road.boundaries or not road.path.near_beginning(road.poses[-1], closing):
                 return None
             smoother.transform_to_origin()
             smoother.refresh()
             ends = {label: boundary.confirmed_end for label, boundary in road.boundaries.items()}
             curves = SampledCurves.of(smoother.map.state.splines, ends)
         seen_in = record.seen_in(smoother.variables.sensor, noise)
-        poses = unwrap(record.poses) if curves is None else record.with_window(road)
+        poses = record.with_newest_path(road, NEWEST_PATHS[-1])
         return return_to_beginning(seen_in, poses, smoother.newest_covariance(), road.settings, curves)
 
 
@@ -172,7 +172,6 @@ class ReturnFinder(Copyable):
 
 REVISIT_ATTEMPTS: Final = 3.0  # distance between attempts (m along the path)
 RETURN: Final = 30.0  # least path length between both passes (m)
-RADIUS: Final = 4.0  # largest distance between both passes in the map (m)
 DIVERGED: Final = 8.0  # least separation of the ways to both passes, seen from the place (m)
 WAY: Final = 100.0  # length of the compared ways (m)
 WAY_STEP: Final = 4.0  # step of their points (m)
@@ -199,7 +198,8 @@ class Revisits(Copyable):
         if place is None or place >= later:
             return None
         seen_in = record.seen_in(road.smoother.variables.sensor, noise)
-        found = newest_place(seen_in, poses, place, Prior.about(poses[-1], *NEARBY), self.settings)
+        nearby = Prior.about(poses[-1], *NEARBY)
+        found = newest_place(seen_in, poses, np.array([place]), nearby, self.settings)
         if found is None:
             return None
         self._next = length + REVISIT_INTERVAL
@@ -212,7 +212,7 @@ def earlier_pass(poses: Array) -> int | None:
     The ways to both passes must part: otherwise the drive came past its start, as in a lap.
     """
     newest = poses[-1]
-    near = np.hypot(*(poses[:, :2] - newest[:2]).T) < RADIUS
+    near = np.hypot(*(poses[:, :2] - newest[:2]).T) < NEARBY[1][0]
     if path_lengths(poses[near.argmax() :])[-1] <= RETURN:
         return None  # only the newest poses are near
     stations = path_lengths(poses)

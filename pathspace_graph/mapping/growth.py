@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 from statistics import median
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 
-from pathspace_graph.copies import shallow
+from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.labels import BOUNDARIES, NAMES, UNKNOWN
@@ -15,7 +15,7 @@ from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import SIDES, Candidates, End, PathAhead, chain, crosses
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
-from pathspace_graph.mapping.tentative import TentativeTracks, add_by_label, nearest_within
+from pathspace_graph.mapping.tracks import Tracks, nearest_within
 from pathspace_graph.settings.online import GrowthSettings
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
@@ -26,23 +26,16 @@ LENGTH_FREE: Final = 50.0  # length of an open curve that is always allowed (m)
 LENGTH_DRIVEN: Final = 2.0  # further length for each metre driven; zigzags between false cones exceed it
 
 
-class Growth:
+class Growth(Copyable):
     """The tentative tracks of both boundaries, and the curves that begin and grow through them."""
 
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings
-        self.tentative = {label: TentativeTracks(settings) for label in BOUNDARIES}  # unexplained cones
+        self.tentative = Tracks(settings.merge_radius, settings.forget_after)  # unexplained cones
         self._known: Mapping[int, float] = {}  # ends of curves that were known before the drive (m)
         self.taken_back = 0  # how often a curve was shortened
         self._full: frozenset[int] = frozenset()  # boundaries that have stopped growing
         self._beside = dict.fromkeys(BOUNDARIES, np.zeros((0, 2)))
-
-    def copy(self) -> Self:
-        """Return an independent copy."""
-        other = shallow(self)
-        other.tentative = {label: tracks.copy() for label, tracks in self.tentative.items()}
-        other._beside = self._beside.copy()
-        return other
 
     def observe(self, track: CurveMap, new: slice, t: float) -> None:
         """Add the new detections that no curve uses to the tentative tracks, seen at t (s)."""
@@ -51,39 +44,29 @@ class Growth:
         rows = rows[~detections.used[rows]]
         points = detections.points_map(rows, variables)
         covariances = detections.covariances_map(rows, variables)
-        add_by_label(self.tentative, detections.label[rows], points, covariances, t)
+        self.tentative.add(points, covariances, detections.label[rows], t)
 
     def expand(self, smoother: CurveSmoother, path_ahead: PathAhead) -> tuple[frozenset[int], str]:
         """Begin or extend each boundary; return the labels of the curves that were extended, and a notice."""
-        full, grown = self._full, set()
+        full, grown, track = self._full, set(), smoother.map
         for label in BOUNDARIES:
-            if label not in smoother.map.state.boundaries:
-                self._begin(smoother.map, label, path_ahead)
-            elif self._waits(smoother.map.state, label):
+            begins = self._known.get(label, -np.inf) - self.settings.reach
+            if label not in track.state.boundaries:
+                self._begin(track, label, path_ahead)
+            elif track.state.pose_u[label][-1] < begins or self._is_full(track, label, path_ahead):
                 continue
-            elif not self._is_full(smoother.map, label, path_ahead) and self._grow(
-                smoother, label, path_ahead
-            ):
+            elif self._grow(smoother, label, path_ahead):
                 grown.add(label)
-        stopped = sorted(self._full - full)
-        return frozenset(grown), "; ".join(_stopped(smoother.map, label) for label in stopped)
+        notices = list[str]()
+        for label in sorted(self._full - full):
+            boundary = track.state.boundaries[label]
+            size, length = f"{boundary.size} control points", f"{boundary.confirmed_end:.3g} m"
+            notices.append(f"the open {NAMES[label]} boundary grows no further, with {size} on {length}")
+        return frozenset(grown), "; ".join(notices)
 
     def wait_for(self, ends: Mapping[int, float]) -> None:
         """Let known curves grow only when the vehicle is near their ends (m), by label."""
         self._known = ends
-
-    def move(self, motion: Array) -> None:
-        for tracks in self.tentative.values():
-            tracks.move(motion)
-
-    def clear(self) -> None:
-        for tracks in self.tentative.values():
-            tracks.clear()
-
-    def _waits(self, state: State, label: int) -> bool:
-        """Whether the vehicle is far from the end of a known curve."""
-        at_end = self._known.get(label, -np.inf) - self.settings.reach
-        return bool(state.pose_u[label][-1] < at_end)
 
     def _begin(self, track: CurveMap, label: int, path_ahead: PathAhead) -> None:
         """Begin a curve through the first candidates, if there are at least two."""
@@ -141,10 +124,10 @@ class Growth:
         """Shorten a curve to its first `kept` cones; the others become tentative tracks again."""
         state, detections = smoother.map.state, smoother.map.detections
         boundary = state.boundaries[label]
-        self.tentative[label].restore(boundary.observed[kept:], smoother.times[-1])
+        self.tentative.restore(boundary.observed[kept:], label, self.settings.sightings, smoother.times[-1])
         boundary.take_back(kept)
         self.taken_back += 1
-        smoother.remove_information(state.keys(label)[boundary.settled(boundary.size) :])
+        smoother.remove_information(state.control_keys(label)[boundary.settled(boundary.size) :])
         rows = detections.used_on(label)
         detections.release(rows[detections.u[rows] > boundary.trusted])
 
@@ -152,7 +135,7 @@ class Growth:
         """Make candidates part of the curve at u (k,), and use the window's detections of them."""
         detections, boundary = track.detections, track.state.boundaries[label]
         boundary.add_cones(found.points, u)
-        self.tentative[label].remove(found.indices)
+        self.tentative.remove(found.indices)
         rows = detections.pending(label)
         points, radius = detections.points_map(rows, track.variables), self.settings.merge_radius
         _, near = nearest_within(points, found.points, radius)
@@ -165,8 +148,8 @@ class Growth:
 
     def _candidates(self, track: CurveMap, label: int, path_ahead: PathAhead, end: End | None) -> Candidates:
         """Return the chain of confirmed tracks within reach, from the end of the curve if there is one."""
-        settings, tracks = self.settings, self.tentative[label]
-        indices = tracks.confirmed()
+        settings, tracks = self.settings, self.tentative
+        indices = tracks.confirmed(label, settings.sightings)
         points = tracks.points[indices]
         if len(points) == 0:
             return Candidates(points, indices, np.zeros(0), np.zeros(0))
@@ -185,19 +168,12 @@ class Growth:
         found = found.where(undisputed(track, label, found.points, settings.merge_radius))
         found = found.where(np.argsort(found.stations))
         found = found.where(chain(found, end))
-        found = found.where(self._certain(label, path_ahead, found))
-        return found if end is None else found.where(_uncrossed(track.state, label, path_ahead, end, found))
-
-    def _certain(self, label: int, path_ahead: PathAhead, found: Candidates) -> IntArray:
-        """Select candidates, by index, up to the first uncertain one ahead.
-
-        In a hairpin, the row of the way back may be known before the next cone of the way there. Uncertain
-        candidates that were passed are skipped.
-        """
-        known = self.tentative[label].sigmas(found.indices) < self.settings.sigma
+        # In a hairpin, the row of the way back may be known before the next cone of the way there: candidates
+        # up to the first uncertain one ahead count. Uncertain ones that were passed are skipped.
+        known = tracks.sigmas(found.indices) < settings.sigma
         waiting = np.flatnonzero(~known & (found.stations > path_ahead.driven))
-        last = int(waiting[0]) if len(waiting) else len(known)
-        return np.flatnonzero(known[:last])
+        found = found.where(np.flatnonzero(known[: waiting[0]] if len(waiting) else known))
+        return found if end is None else found.where(_uncrossed(track.state, label, path_ahead, end, found))
 
     def _is_full(self, track: CurveMap, label: int, path_ahead: PathAhead) -> bool:
         boundary = track.state.boundaries[label]
@@ -263,13 +239,6 @@ def end_of(state: State, label: int, path_ahead: PathAhead, behind: float) -> En
         _, beside = path_ahead.locate(boundary.observed[-NEWEST:])
         side = median([*(SIDES[label] * beside).tolist(), side])
     return End(position[0], float(station[0]), side)
-
-
-def _stopped(track: CurveMap, label: int) -> str:
-    """Notice of a boundary that has just stopped growing."""
-    boundary = track.state.boundaries[label]
-    size, length = boundary.size, boundary.confirmed_end
-    return f"the open {NAMES[label]} boundary grows no further, with {size} control points on {length:.3g} m"
 
 
 def undisputed(track: CurveMap, label: int, points: Array, radius: float) -> BoolArray:

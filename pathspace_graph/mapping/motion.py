@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from math import inf
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 
@@ -81,19 +81,14 @@ def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:
         return KnownNoise(np.array(ODOMETRY_SIGMA), odometry_stated=False)
     if not isinstance(sigma, KnownNoise):
         sigma = KnownNoise(sigma)
-    return replace(sigma, odometry=_positive_sigmas(sigma.odometry))
-
-
-def _positive_sigmas(values: Any) -> Array:
-    """Convert to the standard deviations (3,) of a twist; SettingsError for anything but positive numbers."""
     try:
-        sigmas = np.array(values, float)
+        sigmas = np.array(sigma.odometry, float)
     except (TypeError, ValueError):
         sigmas = np.zeros(0)
     if sigmas.shape != (3,) or not ((sigmas > 0.0) & (sigmas < np.inf)).all():
-        found = values.tolist() if isinstance(values, np.ndarray) else values
+        found = sigma.odometry.tolist() if isinstance(sigma.odometry, np.ndarray) else sigma.odometry
         raise SettingsError(f"odometry_sigma: expected 3 positive numbers, found {found!r:.80}")
-    return sigmas
+    return replace(sigma, odometry=sigmas)
 
 
 def integrate_odometry(odometry: Odometry, until: float, sigma: Array) -> IntegratedOdometry:

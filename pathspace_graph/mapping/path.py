@@ -152,7 +152,8 @@ END_BEHIND: Final = 5.0
 extrapolated. An older stretch of the path across the infield may be nearer to the end."""
 STRANDED: Final = 2.0  # distance behind the vehicle from which an end without candidates is extrapolated (m)
 CARRIED_TO: Final = 1.0  # distance behind the vehicle of an end after its extrapolation (m)
-MIN_LATERAL: Final = 0.5  # least distance from the path of an extrapolated end (m)
+MIN_LATERAL: Final = 0.5  # least distance of a boundary from the path (m)
+BEGIN_LATERAL: Final = 1.5  # distance beside the vehicle at which a row without cones begins (m)
 MIN_CARRY: Final = 0.5  # least length of an extrapolation (m)
 
 

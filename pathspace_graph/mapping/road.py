@@ -11,8 +11,6 @@ import gtsam
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.window import rows_on_poses
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.labels import BOUNDARIES
@@ -21,7 +19,7 @@ from pathspace_graph.spline.boundary import Boundary
 
 from .growth import Growth
 from .motion import MeasuredMotion, predict
-from .orange import OrangeSightings, Sighting, orange_cones
+from .orange import OrangeDetections, orange_cones
 from .path import DrivenPath
 from .smoother import CurveSmoother, Gating
 
@@ -51,7 +49,7 @@ class Road:
         self.path = DrivenPath()
         self.growth = Growth(settings.growth)
         """Tentative tracks, through which the open curves grow."""
-        self.orange = OrangeSightings()
+        self.orange = OrangeDetections()
         """Detections of orange cones, which are points of the map."""
         self.grown: frozenset[int] = frozenset()
         """Curves that grew in the newest cycle; the next one tests the whole window for them."""
@@ -68,7 +66,7 @@ class Road:
         return other
 
     def _attach(self) -> None:
-        self.smoother.attached = [self.smoother.map, self.path, self.growth, self.orange]
+        self.smoother.attached = [self.smoother.map, self.path, self.growth.tentative, self.orange]
 
     # --- the steps of a cycle ----------------------------------------------------------------------------
 
@@ -76,15 +74,11 @@ class Road:
         """Check and add the user's factors; return a notice if that disables something."""
         return HELD if factors and self.smoother.add_factors(factors) else ""
 
-    def rows_of(self, factors: Sequence[gtsam.NonlinearFactor]) -> list[Rows] | None:
-        """Convert the user's factors on poses to rows for a batch; None if one is on points of the map."""
-        return rows_on_poses(factors, self.smoother.variables)
-
     def predict(self, motion: MeasuredMotion, orange: Detections) -> None:
         """Add the pose of a cycle by the calibrated odometry, extend the path, and keep the orange cones."""
         predict(self.smoother, self.path, motion, orange.t)
-        cycle, pose = self.smoother.next_cycle - 1, self.poses[-1].copy()
-        self.orange.add(Sighting(cycle, pose, motion.odometry.twist, orange))
+        cycle, pose = self.smoother.next_cycle - 1, self.poses[-1]
+        self.orange.add(orange, cycle, motion.odometry.twist, pose)
 
     def classify(self, detections: Detections, twist: Array, *, use: bool = True) -> Classified:
         """Add the detections of the newest pose, and use the ones that a curve explains.
@@ -148,14 +142,10 @@ class Road:
         detections = self.smoother.map.detections
         return int(detections.used[detections.cycle.searchsorted(self.next_cycle - 1) :].sum())
 
-    def place_orange(self, corrected: Array) -> None:
-        """Place the detections of orange cones by corrected poses (k, 3) of the first cycles."""
-        self.orange.place((0, corrected))
-
     def orange_cones(self) -> dict[int, PointBoundary]:
         """Merge the orange cones by label, with the present poses of the window."""
-        window = (self.smoother.first_cycle, self.poses)
-        seen = [one.placed_by([window]) for one in self.orange.newest]
+        seen = self.orange.copy()
+        seen.place(self.smoother.first_cycle, self.poses)
         growth, shape = self.settings.growth, self.settings.spline.sigma_shape
         return orange_cones(seen, self.smoother.variables.sensor, growth, shape)
 

@@ -1,7 +1,7 @@
 """The fixed-lag engine on the curves of both boundaries: association, and the active part of the map."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from pathspace_graph.spline.boundary import relocate
 from .curve_map import CurveMap
 from .detection_rows import rows_across
 from .motion import smoother_settings
+
+FAR_STRETCH: Final = 12.0  # least length behind the vehicle of which an open curve becomes inactive (m)
+FAR_ROOM: Final = 40.0  # length beyond what the vehicle sees that stays active (m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +168,8 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
 
         The active part of a closed map is chosen again when it does not contain what the window needs. The
         inactive part of an open map grows with the drive. Inactive control points keep their linearization
-        point; the map differs by this from one that is solved as a whole (`FarSettings`).
+        point. From a map that is solved as a whole, a closed one differs by millimetres to centimetres, an
+        open one by decimetres.
         """
         state = self.map.state
         needed = {label: self._needed(label) for label in state.boundaries}
@@ -173,14 +177,15 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
             _holds(state.active(label), indices, state.boundaries[label].size)
             for label, indices in needed.items()
         ):
-            self.activate(np.concatenate([state.keys(label)[indices] for label, indices in needed.items()]))
+            keys = [state.control_keys(label)[indices] for label, indices in needed.items()]
+            self.activate(np.concatenate(keys))
         elif not self._is_worthwhile(needed):
             return
-        active = {label: self._needed(label, self.map.settings.far.room) for label in state.boundaries}
+        active = {label: self._needed(label, FAR_ROOM) for label in state.boundaries}
         leaving = [np.setdiff1d(state.active(label), indices) for label, indices in active.items()]
         if not any(map(len, leaving)):
             return
-        keys = [state.keys(label)[indices] for label, indices in zip(active, leaving, strict=True)]
+        keys = [state.control_keys(label)[indices] for label, indices in zip(active, leaving, strict=True)]
         self.deactivate(np.concatenate(keys))
         state.activate_only(active)
         self.transform_to_origin()
@@ -193,7 +198,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
             if state.boundaries[label].periodic:
                 return state.whole
             behind.append(int(indices[0] - state.active(label)[0]))
-        return max(behind) * settings.spline.spacing >= settings.far.stretch
+        return max(behind) * settings.spline.spacing >= FAR_STRETCH
 
     def _needed(self, label: int, room: float = 0.0) -> IntArray:
         """Control points (k,) that the window can reach until the next cycle, and `room` (m) ahead.

@@ -1,32 +1,44 @@
 """State of the spline estimators: curves, and the variables of control points and poses."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import is_
 from typing import Any, Final, Self
 
+import gtsam
 import numpy as np
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.factors.linear import keys_of_factor
+from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
     CONTROL_LETTERS,
+    FIRST_POINT,
     ONE_DRIVE,
+    POINT,
     SENSOR_KEY,
     Drives,
+    Layout,
     Variables,
+    are_poses,
     control_keys,
+    indices,
+    sizes,
 )
+from pathspace_graph.graph.window import user_rows
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
 POINTS_PER_FACTOR: Final = 6  # number of consecutive control points whose weak priors form one factor
 SAMPLE: Final = 0.25  # step of the samples of curves that are compared with curves and cones (m)
+SAMPLES_PER_POINT: Final = 3  # points of a curve for each control point that is expressed by them
+NEGLIGIBLE: Final = 1e-6  # share of the largest derivative below which one is left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,14 +154,14 @@ class State:
         other._whole_curves = self._whole_curves and self._whole_curves.on(other.boundaries)
         return other
 
-    def keys(self, label: int) -> IntArray:
+    def control_keys(self, label: int) -> IntArray:
         """Keys (m,) of a boundary's control points."""
         return control_keys(label, self.boundaries[label].numbers)
 
     @property
     def map_keys(self) -> IntArray:
         """Keys (m,) of all boundaries' control points, in the order of `map_points`."""
-        return np.concatenate([np.zeros(0, np.intp), *(self.keys(label) for label in self.boundaries)])
+        return np.concatenate([np.zeros(0, np.intp), *map(self.control_keys, self.boundaries)])
 
     @property
     def map_points(self) -> Array:
@@ -211,18 +223,18 @@ class State:
     def add_boundary(self, label: int, boundary: Boundary, control_points: Array) -> None:
         """Add a boundary with control points (m, 2)."""
         self.boundaries = dict(sorted({**self.boundaries, label: boundary}.items()))
-        self.variables.insert(self.keys(label), control_points.ravel())
+        self.variables.insert(self.control_keys(label), control_points.ravel())
 
     def extend(self, label: int, points: Array) -> None:
         """Add the variables of control points (k, 2) by which a boundary has grown, as active ones."""
         size, count = self.boundaries[label].size, len(points)
-        self.variables.insert(self.keys(label)[size - count :], points.ravel())
+        self.variables.insert(self.control_keys(label)[size - count :], points.ravel())
         if label in self.active_stretch:
             self.active_stretch[label] = np.append(self.active_stretch[label], np.arange(size - count, size))
 
     def replace_boundary(self, label: int, boundary: Boundary, control_points: Array) -> None:
         """Replace a boundary by another one with control points (m, 2)."""
-        self.variables.remove(self.keys(label))
+        self.variables.remove(self.control_keys(label))
         self.add_boundary(label, boundary, control_points)
 
     def close(self, label: int, boundary: Boundary) -> None:
@@ -246,10 +258,10 @@ class State:
 
     def activate(self, keys: IntArray) -> None:
         """Activate control points that are next to the active ones."""
-        for label, indices in self.active_stretch.items():
-            numbers = self.keys(label)[:1] + np.arange(indices[0])
+        for label, active in self.active_stretch.items():
+            numbers = self.control_keys(label)[:1] + np.arange(active[0])
             back = np.flatnonzero(np.isin(numbers, keys))
-            self.active_stretch[label] = np.append(back, indices)
+            self.active_stretch[label] = np.append(back, active)
 
     def activate_only(self, active: dict[int, IntArray]) -> None:
         """Activate exactly these control points, by label; all of a missing label."""
@@ -274,3 +286,73 @@ class State:
 def factor_numbers(points: IntArray, label: int) -> IntArray:
     """Number of the factor with the weak priors of control points (k,), by index."""
     return np.asarray(len(CONTROL_LETTERS) * (points // POINTS_PER_FACTOR) + label)
+
+
+# --- the user's factors on other curves ------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class GivenFactor:
+    """A user's factor as rows that curves on other knots can have, linearized while its variables last.
+
+    The control points of a curve S with the basis B at parameters u are `c = (B' B)^-1 B' S(u)`. So a row on
+    control points is one on points of the curve, and another curve has those at their feet.
+    """
+
+    factor: gtsam.NonlinearFactor  # left out in another process, as one in Python cannot be pickled
+    cycle: int  # first cycle of its poses; without poses the one in which it was given
+    rows: Rows | None = None  # m rows on its poses and calibrations, at values of zero; None if not active
+    points: Mapping[int, Array] = field(default_factory=dict)  # (k, 2) points of each boundary, map frame
+    by_points: Mapping[int, Array] = field(default_factory=dict)  # (m, k, 2) derivatives by them
+
+    @classmethod
+    def of(cls, factor: gtsam.NonlinearFactor, state: State, cycle: int) -> Self:
+        """Linearize a factor that was given in a cycle."""
+        keys = keys_of_factor(factor)
+        cycle = int(indices(keys[are_poses(keys)]).min(initial=cycle))
+        linear = user_rows([factor], state.variables)
+        if not linear:
+            return cls(factor, cycle)
+        rows, keys, points, by_points = linear[0], linear[0].keys[0], dict[int, Array](), dict[int, Array]()
+        others, column_keys = are_poses(keys) | (keys < FIRST_POINT), np.repeat(keys, sizes(keys))
+        for label, boundary in () if others.all() else state.boundaries.items():
+            own = state.control_keys(label)
+            held = keys[np.isin(keys, own)]
+            if len(held) == 0:
+                continue
+            by_control = np.zeros((len(rows), POINT * len(own)))
+            by_control[:, Layout(own).entries(held)] = rows.jacobian[:, np.isin(column_keys, own)]
+            u = np.linspace(boundary.tables.low, boundary.tables.high, SAMPLES_PER_POINT * len(own))
+            basis = boundary.basis(u)
+            weights = np.linalg.solve(basis.T @ basis, basis.T)
+            by_curve = np.einsum("mjd,jk->mkd", by_control.reshape(len(rows), -1, POINT), weights)
+            near = _counts(by_curve)
+            points[label] = boundary.evaluate(state.control_points(label), u[near])
+            by_points[label] = by_curve[:, near]
+        by_others = rows.jacobian[:, np.repeat(others, sizes(keys))]
+        rest = replace(rows, keys=rows.keys[:, others], jacobian=by_others)
+        return cls(factor, cycle, rest, points, by_points)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"factor": None}
+
+    def on(self, state: State) -> list[Rows]:
+        """Return the rows on the variables of a state, or none where it lacks one of their boundaries."""
+        if self.rows is None or not set(self.points) <= set(state.boundaries):
+            return []
+        keys, columns = [self.rows.keys], [self.rows.jacobian]
+        for label, points in self.points.items():
+            boundary = state.boundaries[label]
+            u = boundary.find_anywhere(state.control_points(label), points).u
+            by_control = np.einsum("mkd,kj->mjd", self.by_points[label], boundary.basis(u))
+            near = _counts(by_control)
+            keys.append(np.tile(state.control_keys(label)[near], (len(by_control), 1)))
+            columns.append(by_control[:, near].reshape(len(by_control), -1))
+        rows = replace(self.rows, keys=np.hstack(keys), jacobian=np.hstack(columns))
+        return [rows] if rows.keys.size else []
+
+
+def _counts(derivatives: Array) -> BoolArray:
+    """Whether derivatives (m, k, 2) by each of k points are more than round-off."""
+    largest = np.abs(derivatives).max(axis=(0, 2))
+    return np.asarray(largest > NEGLIGIBLE * largest.max())

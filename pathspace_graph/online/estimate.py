@@ -21,8 +21,8 @@ from pathspace_graph.mapping.motion import vehicle_state, with_size
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.run import Readings
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.ahead import CurveAhead, TrackAhead, check_line, track_ahead
 from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.planning import CurveAhead, TrackAhead, check_line, track_ahead
 
 from .gtsam_graph import window_graph
 from .outlook import Outlook, confirmed, curves_ahead, joint_covariance_of, look_ahead
@@ -66,9 +66,16 @@ class MapperEstimate:
         vehicle is lost. SettingsError is raised for a length out of its range.
         """
         check_line(distance, step)
-        if isinstance(self.phase, Lost):
-            return track_ahead({}, self.road.poses[-1], distance, step)
-        return track_ahead_of(self.road, distance, step)
+        road, track, curves = self.road, self.road.smoother.map, dict[int, CurveAhead]()
+        if isinstance(self.phase, Lost) or not road.smoother.times:
+            return track_ahead(curves, np.zeros(POSE), distance, step)
+        if road.closed:
+            for label, boundary in road.boundaries.items():
+                points = boundary.extended(track.state.control_points(label))
+                curves[label] = CurveAhead(boundary.tables, points, float(track.state.pose_u[label][-1]))
+        else:
+            curves = curves_ahead(track, road.growth.tentative, road.path, road.smoother.times[-1])
+        return track_ahead(curves, road.poses[-1], distance, step)
 
     def looked_at(self) -> AbstractContextManager[None]:
         """Return a context in which no query changes the estimate.
@@ -132,7 +139,7 @@ class MapperEstimate:
 
     def control_keys(self, label: int) -> list[int]:
         """Return the keys of a boundary's control points; they change only when the map is replaced."""
-        keys: list[int] = self.road.smoother.map.state.keys(label).tolist()
+        keys: list[int] = self.road.smoother.map.state.control_keys(label).tolist()
         return keys
 
     # --- the loop ----------------------------------------------------------------------------------------
@@ -268,21 +275,6 @@ def _outlooks(road: Road) -> dict[int, Outlook]:
     if road.closed or road.next_cycle == 0:
         return confirmed(road.smoother.map)
     return look_ahead(road.smoother.map, road.growth.tentative, road.path, road.smoother.times[-1])
-
-
-def track_ahead_of(road: Road, distance: float, step: float) -> TrackAhead:
-    """Return the next `distance` metres of the track in the vehicle's frame, `step` (m) apart."""
-    if not road.smoother.times:
-        return track_ahead({}, np.zeros(POSE), distance, step)
-    track, pose = road.smoother.map, road.poses[-1]
-    if not road.closed:
-        curves = curves_ahead(track, road.growth.tentative, road.path, road.smoother.times[-1])
-        return track_ahead(curves, pose, distance, step)
-    curves = {}
-    for label, boundary in road.boundaries.items():
-        points = boundary.extended(track.state.control_points(label))
-        curves[label] = CurveAhead(boundary.tables, points, float(track.state.pose_u[label][-1]))
-    return track_ahead(curves, pose, distance, step)
 
 
 def readings_of(road: Road) -> Readings:

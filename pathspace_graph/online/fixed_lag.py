@@ -18,6 +18,7 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.loop import worker
 from pathspace_graph.loop.drive import Drive, Phase
 from pathspace_graph.loop.open import Open
 from pathspace_graph.loop.seeking import Seeking
@@ -68,6 +69,7 @@ class FixedLagMapper(MapperEstimate):
         self.phase: Phase = self.FIRST_PHASE(self.settings)
         self.health = Health()  # health of the newest estimate
         self._unused: Odometry | None = None  # twists of a skipped cycle
+        worker.submit(worker.nothing)  # start the process now: a cycle would wait for it
 
     @classmethod
     def on(
@@ -111,8 +113,10 @@ class FixedLagMapper(MapperEstimate):
         `factors` are GTSAM factors of your own, on poses in the window (`pose_key`,
         `next_pose_key`: `Pose2`), on control points (`control_keys`: `Point2`) and on the calibration. Each
         is relinearized at every step until one of its poses leaves the window; then it is part of the prior.
-        The batch of the lap includes factors on poses, linearized in this cycle. A factor on control points
-        prevents the batch and is kept until the loop closes. A factor without information is left out.
+        The batch of the lap includes the factors as rows, since one in Python cannot reach its process:
+        linearized in this cycle, or when the batch begins if it is on control points. There, and after the
+        loop has closed, the curves have other knots. So one on control points becomes one on the points of
+        the curves that determine them. A factor without information is left out.
         SettingsError is raised, and nothing changes, if a key is not a variable of the graph or a number is
         not finite.
 
@@ -141,7 +145,7 @@ class FixedLagMapper(MapperEstimate):
         reading = self.front_end.update(cycle.odometry, cycle.detections)
         road.predict(reading.motion, reading.orange)
         drive.record.measured(reading)
-        drive.record.given(road.rows_of(factors))
+        drive.record.given(factors, road)
         watch.lap("predict")
         twist, use = reading.motion.odometry.twist, self.phase.uses_detections
         classified = road.classify(reading.detections, twist, use=use)

@@ -3,7 +3,7 @@
 The tentative stretch is not in the graph: each query of the map fits it again.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,24 +12,24 @@ from scipy.linalg import block_diag
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.front_end.cone_rows import ConeRow, extend_rows
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.growth import newest, undisputed
-from pathspace_graph.mapping.path import SIDES, DrivenPath
-from pathspace_graph.mapping.tentative import TentativeTracks, nearest_within
+from pathspace_graph.mapping.path import BEGIN_LATERAL, SIDES, DrivenPath
+from pathspace_graph.mapping.tracks import Tracks, nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.ahead import CurveAhead
 from pathspace_graph.spline.boundary import Boundary, Placement, open_boundary
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.planning import CurveAhead
 
 TENTATIVE_REACH: Final = 12.5  # largest distance of a track from the vehicle (m)
 UNCONFIRMED_MEMORY: Final = 0.35
 """Time for which an unconfirmed track is used (s): clutter is not detected again."""
 TAIL: Final = 20.0  # length of the confirmed curve that gives direction and width of the track (m)
 TAIL_STEP: Final = 1.0  # step of the points along that length (m)
-BEGIN_LATERAL: Final = 1.5  # distance beside the vehicle at which a row without a curve begins (m)
 SIGMA_TRACK: Final = 0.1  # standard deviation of cones about a smooth curve, added to a track's own (m)
 SIGMA_BEND: Final = 1.0
 """Standard deviation of the second differences of control points (m). It widens the uncertainty between
@@ -78,7 +78,9 @@ def joint_covariance_of(
         if placement is not None:
             first = begin + POINT * placement.first
             change[kept:, first : begin + known] = np.kron(placement.by_known, eye)
-            change[kept:, -POSE:] = np.kron(placement.by_target, eye) @ _by_pose(outlook.tracks, vehicle)
+            by_pose = np.zeros((len(outlook.tracks), POINT, POSE))  # of tracks fixed to the vehicle
+            by_pose[:, :, :POINT], by_pose[:, :, POINT] = eye, left_of(outlook.tracks - vehicle[:POINT])
+            change[kept:, -POSE:] = np.kron(placement.by_target, eye) @ by_pose.reshape(-1, POSE)
             own = (placement.by_target * outlook.variances) @ placement.by_target.T
             noise[kept:, kept:] = np.kron(own + SIGMA_BEND**2 * placement.by_bend @ placement.by_bend.T, eye)
         changes.append(change)
@@ -90,18 +92,7 @@ def joint_covariance_of(
     return np.asarray(0.5 * (covariance + covariance.T)), blocks
 
 
-def _by_pose(points: Array, vehicle: Array) -> Array:
-    """Return the derivative (2k, 3) of points (k, 2) fixed to the vehicle by its pose (x, y, theta)."""
-    offset = points - vehicle[:2]
-    jacobian = np.zeros((len(points), POINT, POSE))
-    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
-    jacobian[:, 0, 2], jacobian[:, 1, 2] = -offset[:, 1], offset[:, 0]
-    return jacobian.reshape(-1, POSE)
-
-
-def curves_ahead(
-    track: CurveMap, tentative: Mapping[int, TentativeTracks], path: DrivenPath, t: float
-) -> dict[int, CurveAhead]:
+def curves_ahead(track: CurveMap, tentative: Tracks, path: DrivenPath, t: float) -> dict[int, CurveAhead]:
     """Return each open curve from the vehicle on, with the tracks past its end, for `track_ahead`.
 
     The tracks are those of `look_ahead`. No curve is fitted to them, which would take most of the time.
@@ -114,19 +105,17 @@ def curves_ahead(
             end = boundary.confirmed_end
             curves[label] = CurveAhead(boundary.tables, points, beside, end, row.cones)
         elif len(chosen) >= MIN_TRACKS:
-            outlook = _begun(track.settings, row, tentative[label].variances(chosen))
+            outlook = _begun(track.settings, row, tentative.variances(chosen))
             tables, points = outlook.boundary.tables, outlook.control_points
             curves[label] = CurveAhead(tables, points, 0.0, tables.high, confirmed=False)
     return curves
 
 
-def look_ahead(
-    track: CurveMap, tentative: Mapping[int, TentativeTracks], path: DrivenPath, t: float
-) -> dict[int, Outlook]:
+def look_ahead(track: CurveMap, tentative: Tracks, path: DrivenPath, t: float) -> dict[int, Outlook]:
     """Return each open curve with its tentative stretch at t (s), and curves with only such a stretch."""
     state, outlooks = track.state, {}
     for label, (row, chosen) in extended_rows(track, tentative, path, t).items():
-        variances = tentative[label].variances(chosen) + SIGMA_TRACK**2
+        variances = tentative.variances(chosen) + SIGMA_TRACK**2
         if label in state.boundaries:
             known, longer = state.control_points(label), shallow(state.boundaries[label])
             end = longer.confirmed_end
@@ -147,25 +136,28 @@ def confirmed(track: CurveMap) -> dict[int, Outlook]:
 
 
 def extended_rows(
-    track: CurveMap, tentative: Mapping[int, TentativeTracks], path: DrivenPath, t: float
+    track: CurveMap, tentative: Tracks, path: DrivenPath, t: float
 ) -> dict[int, tuple[ConeRow, IntArray]]:
     """Extend the row of each boundary through its tentative tracks; return it with their indices."""
-    tracks = {label: _tracks(track, label, tentative[label], t) for label in BOUNDARIES}
-    rows = {label: _row(track, label, tentative[label].points[tracks[label]]) for label in BOUNDARIES}
+    tracks = {label: _tracks(track, label, tentative, t) for label in BOUNDARIES}
+    rows = {label: _row(track, label, tentative.points[tracks[label]]) for label in BOUNDARIES}
     driven = newest(path.ahead(track.state.poses[-1], 0.0)).points
     extend_rows(rows[LEFT], rows[RIGHT], driven, track.settings.growth.threshold)
     return {label: (row, tracks[label][row.chosen]) for label, row in rows.items()}
 
 
-def _tracks(track: CurveMap, label: int, tracks: TentativeTracks, t: float) -> IntArray:
+def _tracks(track: CurveMap, label: int, tracks: Tracks, t: float) -> IntArray:
     """Return the indices of tracks near the vehicle that are confirmed or were just seen.
 
     Tracks on the curve are left out: the sensor may see an earlier stretch across the infield.
     """
     settings, state = track.settings.growth, track.state
     near = np.hypot(*(tracks.points - state.poses[-1, :2]).T) < TENTATIVE_REACH
-    believed = (tracks.counts >= settings.sightings) | (tracks.last_t > t - UNCONFIRMED_MEMORY)
+    count = tracks.votes[:, label]
+    believed = (count >= settings.sightings) | ((count > 0) & (tracks.last_t > t - UNCONFIRMED_MEMORY))
     indices = np.flatnonzero(near & believed)
+    if len(indices) == 0:
+        return indices
     if label in state.boundaries:
         boundary, radius = state.boundaries[label], settings.merge_radius
         u = np.arange(0.0, boundary.confirmed_end - radius, settings.threshold)

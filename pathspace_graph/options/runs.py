@@ -50,7 +50,7 @@ class FolderCommand(Command):
 # --- maps of logs, and exports of them -------------------------------------------------------------------
 
 MapKind = Literal["boundaries", "centerline"]
-Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile"]
+Format = Literal["centerline", "tum", "geojson", "points", "lanelet2", "profile", "graph", "g2o", "dot"]
 
 
 _SETTINGS: Final = Parameter(group=Group("Settings of the estimators", sort_key=2))
@@ -147,6 +147,8 @@ class Batch(Checked, Estimation, FolderCommand, group=""):
     """Kind of map: two boundaries, or one centre line with a width."""
     start: Start | None = None
     """Where the optimization begins; by default that of `batch.start`."""
+    graph: bool = False
+    """Also write the optimized factor graph of a log (`graph.json`, 10 MB a lap), which `export` reads."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,6 +168,21 @@ class Plot(Checked, Command, group=""):
 
 
 @dataclass(frozen=True, kw_only=True)
+class View(Command):
+    """Write a result as one page for any browser, which needs no server and no network.
+
+    Map with 2-sigma bands, path, the vehicle by time, health, notices, calibration and metrics.
+    """
+
+    result: Path = field(kw_only=False)
+    """Folder of the map."""
+    html: Annotated[Path, FILE]
+    """File for the page, or standard output (`-`)."""
+    other: Path | None = None
+    """Folder of another map of the track, to align with this one and to draw beside it."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Export(Command):
     """Write a map in a format that planners and other tools read."""
 
@@ -174,8 +191,10 @@ class Export(Command):
     format: Annotated[Format, Parameter(name="--as")]
     """Format of the file: the centre line with widths as TUM raceline CSV (`centerline`), the trajectory in
     the TUM format (`tum`), boundaries and centre line as GeoJSON (`geojson`), both boundaries as CSV with the
-    columns x, y and label (`points`), both boundaries with lanelets as OSM XML (`lanelet2`), or the centre
-    line with the speed that friction and curvature allow as CSV (`profile`)."""
+    columns x, y and label (`points`), both boundaries with lanelets as OSM XML (`lanelet2`), the centre
+    line with the speed that friction and curvature allow as CSV (`profile`), or of a `batch --graph` the
+    factor graph as JSON of GTSAM's texts (`graph`), for Graphviz (`dot`), or its poses with odometry and
+    revisits (`g2o`)."""
     out: Annotated[Path, FILE]
     """File for the result, or standard output (`-`)."""
     step: float = 1.0

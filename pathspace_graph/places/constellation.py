@@ -19,9 +19,9 @@ from pathspace_graph.factors.se2 import (
     to_map,
     to_vehicle,
 )
-from pathspace_graph.labels import UNKNOWN
+from pathspace_graph.labels import BOUNDARIES, UNKNOWN
 from pathspace_graph.mapping.detections import DetectionColumns
-from pathspace_graph.mapping.tentative import merged_in_turn
+from pathspace_graph.mapping.tracks import Tracks
 from pathspace_graph.settings.online import GrowthSettings
 from pathspace_graph.spline.bspline import BSpline
 
@@ -31,13 +31,14 @@ VOTE_CELL: Final = 0.5  # cell size of the votes (m)
 VOTE_TURN: Final = 0.05  # step of the headings (rad)
 PLACES_APART: Final = 1.0  # least distance of two different places (m)
 PLACES: Final = 10  # largest number of places for each heading, and a third of those refined
-UNSEEN: Final = 2.0  # largest cost of a cone out of view: the expectation of a matching one in 2D
+MATCHING: Final = 2.0
+"""Expected square of a matching cone in 2D: the largest mean at a place, and cost of a cone out of view."""
 FAILED: Final = 20.0  # largest cost of the distance from a prior: twice the log odds against its failure
-FIT_LIMITS: Final = (FIT_SIGMA, FIT_GATE, VOTE_CELL, VOTE_TURN, PLACES_APART, float(PLACES), UNSEEN, FAILED)
+FIT_LIMITS: Final = (FIT_SIGMA, FIT_GATE, VOTE_CELL, VOTE_TURN, PLACES_APART, float(PLACES), MATCHING, FAILED)
+REACH: Final = (6.0, 0.2)  # largest distance and angle of a place from a pose on a path (m, rad)
 MERGE_RANGE: Final = 16.0  # largest range of merged detections (m)
 VIEWED: Final = 0.95  # share of the detections within the range and the bearing of a view
-VIEWS: Final = 2.0  # distance of the views along a path (m)
-CONE_SIGHTINGS: Final = 3  # least number of detections of a cone
+PATH_STEP: Final = 2.0  # distance of neighbouring poses from which cones are seen, or a place is tried (m)
 LINE_WEIGHT: Final = 0.25
 """Weight of a point of a line, merged to about 1 m: neighbours on a line say the same for 4 m."""
 
@@ -50,7 +51,6 @@ CURVE_GATES: Final = (3.0, 2.0, 1.2, 0.7)  # largest distance from a curve, by i
 
 ConeArrays = tuple[Array, Array, IntArray]
 """Points (n, 2), covariances (n, 2, 2) and labels (n,) of cones."""
-NO_FIT_CONES: Final[ConeArrays] = (np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, np.intp))
 EVERYWHERE: Final[Array] = np.array([[0.0, 0.0, 0.0, inf, inf]])
 """View of a complete constellation."""
 
@@ -61,20 +61,30 @@ class Prior:
 
     poses: Array  # (k, 3) map frame
     information: Array  # (3, 3) map frame
-    reach: tuple[float, float]  # largest distance and angle from such a pose (m, rad)
+    reach: tuple[float, float] = REACH  # largest distance and angle from a pose that is tried (m, rad)
     failed: float = FAILED  # cost of the vehicle at none of them: twice the log odds against it
-    starts: Array | None = None  # (j, 3) poses from which lines are fitted about a single pose
+    along: Array | None = None  # (j, 3) poses that are tried, where `poses` is a single one
 
     @classmethod
     def about(
         cls,
         poses: Array,
         sigmas: tuple[float, float, float],
-        reach: tuple[float, float],
+        reach: tuple[float, float] = REACH,
         failed: float = FAILED,
     ) -> Self:
         """Return a prior with standard deviations (m, m, rad)."""
         return cls(np.atleast_2d(poses), np.diag(np.array(sigmas) ** -2.0), reach, failed)
+
+    @property
+    def tried(self) -> Array:
+        """Poses (j, 3) about which places are searched."""
+        return self.poses if self.along is None else self.along
+
+    @property
+    def means(self) -> Array:
+        """Means (j, 3) of the Gaussians at the poses that are tried."""
+        return np.ascontiguousarray(np.broadcast_to(self.poses, self.tried.shape))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,16 +129,13 @@ class Constellation:
         rows = rows[np.argsort(np.trace(table.covariance[rows], axis1=1, axis2=2), kind="stable")]
         at = poses[table.cycle[rows]]
         points, covariances = to_map(point[rows], at), rotated(table.covariance[rows], at[:, 2])
-        labels, found = table.label[rows], [NO_FIT_CONES]
-        for label in np.unique(labels).tolist():
-            own = labels == label
-            places, information, counts = merged_in_turn(points[own], covariances[own], settings)
-            seen = counts >= CONE_SIGHTINGS
-            covariance = np.asarray(np.linalg.inv(information[seen]), np.float64)
-            found.append((places[seen], covariance, np.full(len(covariance), label)))
-        places, covariances, labels = (np.concatenate(column) for column in zip(*found, strict=True))
+        tracks = Tracks(settings.merge_radius, np.inf)
+        tracks.add(points, covariances, table.label[rows], np.arange(len(rows), dtype=float))
+        seen = np.concatenate([tracks.confirmed(label, settings.sightings) for label in BOUNDARIES])
+        labels = tracks.votes[seen].argmax(axis=1)
+        covariances = np.asarray(np.linalg.inv(tracks.information[seen]), np.float64)
         views = _views(poses[np.unique(table.cycle)], point[rows])
-        return cls(places, covariances, labels, views, LINE_WEIGHT if of_lines else 1.0)
+        return cls(tracks.points[seen], covariances, labels, views, LINE_WEIGHT if of_lines else 1.0)
 
     def __len__(self) -> int:
         return len(self.labels)
@@ -152,18 +159,16 @@ class Constellation:
         All pairs of a seen and a known cone of one label vote for the pose that lays one on the other. The
         poses with most votes near the prior's are refined on a sum of capped squares.
         """
-        places = kernels.laid(
-            seen.cones, self.cones, self.views, prior.poses, prior.information, prior.reach, FIT_LIMITS
-        )
-        return Fits(*places)
+        searched = prior.tried, prior.means, prior.information, prior.reach
+        return Fits(*kernels.laid(seen.cones, self.cones, self.views, *searched, FIT_LIMITS))
 
 
 def _views(poses: Array, points: Array) -> Array:
-    """Views (k, 5) from poses (P, 3), `VIEWS` apart, with the limits of the detections (m, 2)."""
+    """Views (k, 5) from poses (P, 3), `PATH_STEP` apart, with the limits of the detections (m, 2)."""
     if len(points) == 0:
         return np.zeros((0, 5))
     far, wide = np.quantile(np.abs([np.hypot(*points.T), np.arctan2(*points.T[::-1])]), VIEWED, axis=1)
-    _, first = np.unique(path_lengths(poses) // VIEWS, return_index=True)
+    _, first = np.unique(path_lengths(poses) // PATH_STEP, return_index=True)
     return np.column_stack([poses[first], np.tile([far, wide], (len(first), 1))])
 
 
@@ -204,9 +209,7 @@ class SampledCurves:
 
         Iterated closest points minimize the sum of squares across the curves, with the prior.
         """
-        starts = prior.poses if prior.starts is None else prior.starts
-        means = np.broadcast_to(prior.poses, starts.shape)
-        pairs = zip(starts, means, strict=True)
+        pairs = zip(prior.tried, prior.means, strict=True)
         return Fits.joined([self._fit(seen, start, mean, prior.information) for start, mean in pairs])
 
     def _fit(self, seen: Constellation, start: Array, mean: Array, information: Array) -> Fits:

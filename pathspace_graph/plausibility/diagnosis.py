@@ -1,14 +1,16 @@
 """Calibration and noise in words: results of a run, and hints where a log states another noise."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.health import LOST
+from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunNoise, RunResult, VehicleState
 from pathspace_graph.spline.boundary import Crossing, crossed_boundaries
 
@@ -52,9 +54,14 @@ def diagnose(state: VehicleState, settings: Mapping[str, Any]) -> list[str]:
 def crossings_of(result: RunResult) -> list[Crossing]:
     """Places where the vehicle crossed the boundaries of its map, unless it was lost there."""
     path = result.trajectory if result.smoothed is None else result.smoothed
-    lost = np.array([record.health == LOST for record in result.cycles], bool)
+    return crossings_on(result.map, path, [record.health for record in result.cycles])
+
+
+def crossings_on(track: Map, path: Array, health: Sequence[str]) -> list[Crossing]:
+    """Places where a path (n, 3) crosses the boundaries of a map, but for poses that were lost."""
+    lost = np.array([condition == LOST for condition in health], bool)
     known = ~lost if len(lost) == len(path) else None
-    return crossed_boundaries(result.map.splines, path[:, :2], known)
+    return crossed_boundaries(track.splines, path[:, :2], known)
 
 
 CLEAR_ERROR: Final = 4.0  # standard deviations beyond which a measured error of the sensor is reported

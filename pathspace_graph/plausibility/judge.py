@@ -27,7 +27,7 @@ from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.gate import TWIST, check_usable
 from pathspace_graph.front_end.measurement import LEAST_NOISE
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
-from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_UNKNOWN, TwistRecord
+from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_MOST, TwistRecord
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, covariances_of
 from pathspace_graph.io.log_files import read_log
@@ -112,9 +112,14 @@ def hints(log: Log) -> list[Hint]:
     stay = log.sensor.kind != "line" and not is_line(log)
     with threadpool_limits(limits=1):
         found += of_positions + of_rows + (camera(log) or motion_hints(log))
-        found = found or side_hints(log) or kind_hints(log)
-        if stay:
-            found = found or one_label(log)
+        found = found or side_hints(log)
+        stated = log.sensor.kind or "cones"
+        seen = {True: "line", False: "cones", None: stated}[None if found else is_line(log)]
+        if seen != stated:
+            found = [hint_of(f"kind {seen}", stated=stated)]
+        labels, share = {*np.unique(_labels(log)).tolist()}, sided(log)
+        if not found and stay and labels in ({LEFT}, {RIGHT}) and abs(share - 0.5) <= 0.15:
+            found = [hint_of("one label", label=NAMES[labels.pop()], share=100.0 * share)]
     if not found:
         found += _odometry_hints(log) if log.odometry_stated else []
         found += _detection_hints(log) if log.detections_stated and stay else []
@@ -125,8 +130,6 @@ def hints(log: Log) -> list[Hint]:
 
 TIME_UNITS: Final = {1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}  # by size (s)
 LENGTH_UNITS: Final = {1e-2: "centimetres", 1e-3: "millimetres"}  # by size (m)
-WITHOUT_DETECTIONS: Final = 10.0  # longest drive before the first detection or after the last one (s)
-FASTEST: Final = 100.0, 8.0  # speed (m/s) and yaw rate (rad/s) that no vehicle exceeds in a tenth of its time
 
 
 def parts_of_stamps(log: Log) -> list[Hint]:
@@ -180,8 +183,8 @@ def gaps_and_reach(log: Log) -> list[Hint]:
     t, speed = log.odometry.t, np.hypot(*log.odometry.twist[:, :2].T)
     begin, end = log.cycles[0].t, log.cycles[-1].t
     driven = t[speed > 0.1 * speed.max()]  # else it stands
-    early = driven.size and begin - driven[0] > WITHOUT_DETECTIONS
-    late = driven.size and driven[-1] - end > WITHOUT_DETECTIONS
+    early = driven.size and begin - driven[0] > 10.0
+    late = driven.size and driven[-1] - end > 10.0
     found = [hint_of("detections begin late", seconds=begin - t[0])] if early else []
     found += [hint_of("detections end early", seconds=t[-1] - end)] if late else []
     typical = _median(np.array([len(cycle.labels) for cycle in log.cycles]))
@@ -221,8 +224,9 @@ def possible_rows(log: Log) -> tuple[Log, list[Hint]]:
 def beyond_any_vehicle(log: Log) -> list[Hint]:
     vx, vy, wz = log.odometry.twist.T
     speed, rate = (np.quantile(one, 0.9) for one in (np.hypot(vx, vy), np.abs(wz)))
-    found = [hint_of("too fast", speed=speed)] if speed > FASTEST[0] else []
-    return found + ([hint_of("turns too fast", rate=rate)] if rate > FASTEST[1] else [])
+    # that no vehicle exceeds in a tenth of its time (m/s, rad/s)
+    found = [hint_of("too fast", speed=speed)] if speed > 100.0 else []
+    return found + ([hint_of("turns too fast", rate=rate)] if rate > 8.0 else [])
 
 
 def camera(log: Log) -> list[Hint]:
@@ -232,13 +236,6 @@ def camera(log: Log) -> list[Hint]:
     least, most = spread.min(), spread.max()
     in_line = least < 0.1 * most  # all detections on a line
     return [hint_of("camera", thin="xy"[int(spread.argmin())], least=least, most=most)] if in_line else []
-
-
-def one_label(log: Log) -> list[Hint]:
-    share, labels = sided(log), set(np.unique(_labels(log)).tolist())
-    if labels not in ({LEFT}, {RIGHT}) or abs(share - 0.5) > 0.15:
-        return []
-    return [hint_of("one label", label=NAMES[labels.pop()], share=100.0 * share)]
 
 
 def sided(log: Log, turn: complex = 1.0, *, mirrored: bool = False) -> float:
@@ -268,15 +265,9 @@ def _median(values: Array) -> float:
 # --- the regression in words -----------------------------------------------------------------------------
 
 SPEED_UNITS: Final = {1.0 / 3.6: "km/h", 0.44704: "mph", 0.514444: "knots", 1e-2: "cm/s", 1e-3: "mm/s"}
-RATE_UNITS: Final = {float(np.pi / 180.0): "degrees per second"}
-SAME_FACTOR: Final = 1.2  # largest ratio of a factor and a unit
-FACTOR_TOLD: Final = 1.6  # least factor, or its inverse, that is told if it is no unit
 TINY: Final = 1e-9  # least size of a factor
 TURN_TOLD: Final = 8.5  # least yaw of the sensor that is told (degrees)
-FLAT: Final = 0.2  # largest size of a missing rate, by what the cones show
-UNEXPLAINED: Final = 30.0, 0.2  # largest share of pairs that show a motion (%), and its explained degree
 WELL_EXPLAINED: Final = 0.5  # least explained share for a small turn and a place, and for another drive
-SIDES: Final = 2000, 100  # approximate number of cycles of a side in use, and least number of motions
 FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation (degrees) and whether mirrored
     (180, False): ("the sensor's frame has x to the rear and y to the right", "-x", "-y"),
     (-90, False): ("the sensor's frame has x to the right and y ahead", "y", "-x"),
@@ -287,14 +278,6 @@ FRAMES: Final = {  # frames of detections, and columns for x and y, by rotation 
 }
 
 
-def kind_hints(log: Log) -> list[Hint]:
-    """Hint if detections are of the other kind than the log says, which is cones by default."""
-    stated = log.sensor.kind or "cones"
-    found = {True: "line", False: "cones", None: stated}[is_line(log)]
-    return [hint_of(f"kind {found}", stated=stated)] if found != stated else []
-
-
-OF_LINES: Final = {"yaw rate", "clocks", "y to the right"}  # causes that points of lines tell
 Told = dict[Hint, float]  # hints, and how much more of the motions each explains
 
 
@@ -302,7 +285,7 @@ def motion_hints(log: Log) -> list[Hint]:
     """Hints by the regression, the strongest first."""
     motions, told = motions_of(log), Told()
     share = 100.0 * len(motions.rate) / max(motions.tried, 1)
-    few = motions.tried >= 30 and share < UNEXPLAINED[0]
+    few = motions.tried >= 30 and share < 30.0  # %
     unexplained = [hint_of("unexplained", share=share, tried=motions.tried)] if few else []
     if len(motions.rate) < 20:
         return beyond_any_vehicle(log) or unexplained
@@ -318,7 +301,7 @@ def motion_hints(log: Log) -> list[Hint]:
     at_rest = far_better(rest.both, regression.explained(Fit()).both)
     if at_rest and may_rest and not (lines or of_log):
         return [hint_of("map frame", evidence=at_rest.words)]
-    if unexplained and not lines and explained.both.mean() < UNEXPLAINED[1]:
+    if unexplained and not lines and explained.both.mean() < 0.2:
         return unexplained
     add_hint(told, why.get("content"), "pose" if fit.content == "pose" else "fixed frame")
     when, before, after, jumping, constant = regression.jump(fit)
@@ -332,7 +315,8 @@ def motion_hints(log: Log) -> list[Hint]:
     if not may_rest and all(hint.cause != "speeds" for hint in told):
         tell_factors(told, regression, fit)
         tell_frame(told, regression, fit, log)
-    told = {hint: gain for hint, gain in told.items() if not lines or hint.cause in OF_LINES}
+    if lines:  # whose points tell these causes only
+        told = {hint: told[hint] for hint in told if hint.cause in ("yaw rate", "clocks", "y to the right")}
     return sorted(told, key=lambda hint: -told[hint]) or beyond_any_vehicle(log)
 
 
@@ -350,9 +334,9 @@ def tell_missing(told: Told, regression: Regression, fit: Fit) -> None:
     rates = {"stated": float(stated_w.std()), "seen": float(shown_w.std())}
     speeds = {"stated": np.abs(stated_v).mean(), "seen": np.abs(shown_v).mean()}
     backward = regression.shares(np.where((v.conj() * shown_v).real < 0.0, -v, v), w)
-    if turn and rates["stated"] < FLAT * rates["seen"]:
+    if turn and rates["stated"] < 0.2 * rates["seen"]:
         add_hint(told, turn, "no yaw rate", **rates)
-    elif way and speeds["stated"] < FLAT * speeds["seen"]:
+    elif way and speeds["stated"] < 0.2 * speeds["seen"]:
         add_hint(told, way, "no speed", **speeds)
     elif no_sign := far_better(backward.way, explained.way):
         add_hint(told, no_sign, "no sign")
@@ -372,7 +356,7 @@ def tell_factors(told: Told, regression: Regression, fit: Fit) -> None:
         return
     for better, mistake, (unit, size) in (
         (speeds, "unit of speeds", unit_of(speed, SPEED_UNITS)),
-        (rates, "unit of yaw rate", unit_of(rate, RATE_UNITS)),
+        (rates, "unit of yaw rate", unit_of(rate, {float(np.pi / 180.0): "degrees per second"})),
     ):
         add_hint(told, better if unit else None, mistake, unit=unit, size=size)
 
@@ -380,9 +364,9 @@ def tell_factors(told: Told, regression: Regression, fit: Fit) -> None:
 def unit_of(size: float, units: Mapping[float, str]) -> tuple[str, float]:
     """Name and size of the unit near a size, or of an unknown unit; without a name near 1."""
     near = min(units, key=lambda one: abs(np.log(one / max(size, TINY))))
-    if 1.0 / SAME_FACTOR < size / near < SAME_FACTOR:
+    if 1.0 / 1.2 < size / near < 1.2:
         return units[near], near
-    return "" if 1.0 / FACTOR_TOLD < size < FACTOR_TOLD else f"units of {size:.3g}", size
+    return "" if 1.0 / 1.6 < size < 1.6 else f"units of {size:.3g}", size
 
 
 def tell_frame(told: Told, regression: Regression, fit: Fit, log: Log) -> None:
@@ -425,11 +409,11 @@ def side_hints(log: Log) -> list[Hint]:
 
     The sides are those of the vehicle, as of two cameras; in a bend a left cone may be on the right.
     """
-    lags, (most, least) = [], SIDES
+    lags = []
     for side in (1.0, -1.0):
         cycles = tuple(cycle.where(side * cycle.points_vehicle[:, 1] > 0.0) for cycle in log.cycles)
-        motions = motions_of(replace(log, cycles=cycles), most, MIN_MATCHED, fastest=0.0)
-        if len(motions.rate) < least:
+        motions = motions_of(replace(log, cycles=cycles), 2000, MIN_MATCHED, fastest=0.0)
+        if len(motions.rate) < 100:
             return []
         regression = Regression(log.odometry, motions)
         fit = regression.fit("twist", 0.0)
@@ -446,10 +430,6 @@ def side_hints(log: Log) -> list[Hint]:
 
 # --- noise that is stated ------------------------------------------------------------------------------
 
-NOISE_FACTOR: Final = 1.5  # least ratio of measured and stated noise of the odometry for a hint
-SCATTER_FACTOR: Final = 2.0  # least ratio of measured and stated noise of detections for a hint
-UNIT_FACTOR: Final = 10.0  # least ratio that tells another unit
-
 
 def _odometry_hints(log: Log) -> list[Hint]:
     """Compare white noise: orders of differences that disagree contain motion as well."""
@@ -462,8 +442,8 @@ def _odometry_hints(log: Log) -> list[Hint]:
     agree = orders.max(axis=0) < 1.2 * least
     most = np.hypot(least, np.array(ASSUMED_DRIFT) / np.sqrt(interval))
     for which, values, size in (
-        (agree & (least > NOISE_FACTOR * stated), least, "small"),
-        (NOISE_FACTOR * most < stated, most, "large, unless it stands for errors that change slowly"),
+        (agree & (least > 1.5 * stated), least, "small"),
+        (1.5 * most < stated, most, "large, unless it stands for errors that change slowly"),
     ):
         figures = [
             f"{name} scatters by {value:.2g} {TWIST[name]}, and {said:.2g} is stated"
@@ -488,16 +468,15 @@ def _detection_hints(log: Log) -> list[Hint]:
     stated = ray_sigmas(points, np.concatenate([cycle.covariances for cycle in cycles]))
     near = (ranges := np.hypot(*points.T)) < FOLLOW_RANGE
     ranges, stated, at = ranges[near], stated[near], float(np.median(ranges[near]))
-    gate = np.minimum(GATE_UNKNOWN[0] + GATE_UNKNOWN[1] * ranges, GATE_UNKNOWN[2])
     floors = np.full(len(ranges), LEAST_NOISE[0]), LEAST_NOISE[1] * ranges
     rays = ("along", measured.along), ("across", measured.across)
     for (way, ray), claimed, floor in zip(rays, stated.T, floors, strict=True):
         sigmas, scatter = ray.sigmas(ranges), float(ray.sigmas(np.array([at]))[0])
-        small = (sigmas > SCATTER_FACTOR * np.maximum(claimed, floor)).mean()
-        large = ((SCATTER_FACTOR * sigmas < claimed) & (3.0 * sigmas < gate)).mean()
+        small = (sigmas > 2.0 * np.maximum(claimed, floor)).mean()
+        large = ((2.0 * sigmas < claimed) & (3.0 * sigmas < GATE_MOST)).mean()
         if max(small, large) > 0.75:
             ratio = float(np.median(claimed / sigmas))
-            is_unit = not 1.0 / UNIT_FACTOR < ratio < UNIT_FACTOR
+            is_unit = not 0.1 < ratio < 10.0
             how = f"too {'small' if small > large else 'large'}"
             how += ", as in another unit, or there are none at all" if is_unit else ""
             figures = {
@@ -514,19 +493,12 @@ def _detection_hints(log: Log) -> list[Hint]:
 
 # --- cones, or points of lines -------------------------------------------------------------------------
 
-COMPARED: Final = 2  # nearest detections of a side that are compared: noise grows with the range
-MOVED: Final = 0.25  # least way between both cycles, over the gap: at rest a line is seen at the same places
-LONGEST: Final = 1.5  # longest time between them (s), over which odometry hardly drifts
-FEWEST: Final = 80  # comparisons that tell: the median of a line has a sigma of 0.08
-CONES: Final = 0.32  # median distance over half the gap up to which they are cones
-LINE: Final = 0.4  # from which on they are points of a line; between, it cannot be told
-
 
 @lru_cache(maxsize=2)
 def is_line(log: Log) -> bool | None:
     """Whether the detections of the first seconds of a log are points of lines; None if that is not clear.
 
-    The nearest detections of each side are laid on those of an earlier cycle by odometry. Cones find
+    The two nearest detections of each side are laid on those of an earlier cycle by odometry. Cones find
     themselves there, within their noise. Points of a line find a neighbour: at distances that are spread
     evenly over half the gap between points, whatever the gap.
     """
@@ -544,30 +516,33 @@ def is_line(log: Log) -> bool | None:
                 seen.append((cycle.t, pose, points, sigmas))
         if not seen:
             continue
-        gaps = (np.asarray(KDTree(points).query(points[:COMPARED], k=2)[0]) for _, _, points, _ in seen)
+        gaps = (np.asarray(KDTree(points).query(points[:2], k=2)[0]) for _, _, points, _ in seen)
         gap = float(np.median([np.median(apart[:, 1]) for apart in gaps]))
         for k, (t, pose, points, sigmas) in enumerate(seen):
-            begin = int(np.searchsorted([one[0] for one in seen[:k]], t - LONGEST))
-            for _, earlier, partners, _ in reversed(seen[begin:k]):
+            begin = int(np.searchsorted([one[0] for one in seen[:k]], t - 1.5))
+            for _, earlier, partners, _ in reversed(seen[begin:k]):  # over 1.5 s odometry hardly drifts
                 way = relative(earlier, pose)
-                if np.hypot(way[0], way[1]) < MOVED * gap:
+                if np.hypot(way[0], way[1]) < 0.25 * gap:  # at rest a line is seen at the same places
                     continue
-                placed = move_points(way, points[:COMPARED])
+                placed = move_points(way, points[:2])
                 found = np.hypot(*placed.T) < np.hypot(*partners[-1])
                 apart = KDTree(partners).query(placed[found])[0]
                 away += np.minimum(apart / (0.5 * gap), 1.5).tolist()
-                sigma = np.maximum(2.0**0.5 * sigmas[:COMPARED][found], 1e-3)
-                across += (_from_line(placed[found], partners) / sigma).tolist()
+                sigma = np.maximum(2.0**0.5 * sigmas[:2][found], 1e-3)
+                off, step = placed[found, None] - partners[:-1], np.diff(partners, axis=0)
+                along = np.clip((off * step).sum(axis=2) / (step**2).sum(axis=1), 0.0, 1.0)
+                aside = np.hypot(*(off - along[..., None] * step).transpose(2, 0, 1)).min(axis=1)
+                across += (aside / sigma).tolist()
                 break
             # comparisons that are enough: 0.1 to 0.27 was met for cones, 0.46 to 1.2 for lines
             if len(away) >= (side + 1) * 300 // 2:
                 break
-    if len(away) < FEWEST:
+    # the median of 80 points of a line has a sigma of 0.08; what is off the line by 2.2 sigmas is garbled
+    if len(away) < 80 or (
+        np.median(away) >= 0.32 and not (np.median(away) > 0.4 and np.median(across) < 2.2)
+    ):
         return None
-    if np.median(away) < CONES:
-        return False
-    # what is farther from the line than 2.2 sigmas is garbled
-    return True if np.median(away) > LINE and np.median(across) < 2.2 else None
+    return bool(np.median(away) > 0.4)
 
 
 def _nearest_of_side(detections: Detections) -> tuple[Array, Array]:
@@ -583,19 +558,7 @@ def _nearest_of_side(detections: Detections) -> tuple[Array, Array]:
     return points[chosen], np.sqrt(variances[chosen])
 
 
-def _from_line(points: Array, corners: Array) -> Array:
-    """Distances (m,) of each point (m, 2) from the line through corners (k, 2), at least two."""
-    begin, step = corners[:-1], np.diff(corners, axis=0)
-    off = points[:, None] - begin
-    share = np.clip((off * step).sum(axis=2) / (step**2).sum(axis=1), 0.0, 1.0)
-    return np.asarray(np.hypot(*(off - share[..., None] * step).transpose(2, 0, 1)).min(axis=1))
-
-
 # --- logs that are refused, and words of labels ----------------------------------------------------------
-
-NO_LABEL_WORDS: Final = frozenset({"unknown", "", "none", "nan", "null"})  # words for no label
-# causes of a refusal, by the size of numbers; labels and frames are never the cause
-REFUSABLE: Final = {"stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances"}
 
 
 def read_usable_log(folder: Path, limits: LimitSettings, scale: float | None = None) -> Log:
@@ -620,11 +583,20 @@ def read_plausible_log(
         log = read_usable_log(folder, limits, scale)
     except InputError as error:
         of_data = error.file.name in (ODOMETRY_FILE, DETECTIONS_FILE)
-        found = [hint for hint in refused_hints(folder) if hint.cause in REFUSABLE] if of_data else []
+        by_size = ("stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances")
+        found = [hint for hint in refused_hints(folder) if hint.cause in by_size] if of_data else []
         if not found:
             raise
         raise InputError(error.file, f"{error.message}; {because(found)}", error.row) from error
-    return log, hints(log) + _foreign_label_hints(folder, log)
+    found = hints(log)
+    if log.cycles and (_labels(log) == UNKNOWN).all():
+        met = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"]).most_common()
+        foreign = [
+            word for word, _ in met if word.strip().lower() not in ("unknown", "", "none", "nan", "null")
+        ]
+        words = ", ".join(map(shown, foreign[:3]))
+        found += [hint_of("foreign labels", words=words)] if foreign else []
+    return log, found
 
 
 def refused_hints(folder: Path) -> list[Hint]:
@@ -639,12 +611,3 @@ def refused_hints(folder: Path) -> list[Hint]:
         return []
     cycles = logs.cycles_of(stamps, points, covariances, logs.labels_of(table))
     return hints(Log(Odometry(*twists), cycles, np.ones(3), odometry_stated=False))
-
-
-def _foreign_label_hints(folder: Path, log: Log) -> list[Hint]:
-    if not log.cycles or any((cycle.labels != UNKNOWN).any() for cycle in log.cycles):
-        return []
-    met = Counter(read_table(folder / DETECTIONS_FILE, ("label",)).columns["label"])
-    foreign = [word for word, _ in met.most_common() if word.strip().lower() not in NO_LABEL_WORDS]
-    words = ", ".join(map(shown, foreign[:3]))
-    return [hint_of("foreign labels", words=words)] if foreign else []

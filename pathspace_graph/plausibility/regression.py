@@ -11,6 +11,7 @@ could not tell it from a factor.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from math import ceil, pi
 from typing import Any, Final, Literal, NamedTuple
 
@@ -36,7 +37,6 @@ Complex = NDArray[np.complex128]
 # --- motion by the cones ---------------------------------------------------------------------------------
 
 MOST_CYCLES: Final = 1000  # approximate number of cycles in use, in bursts of successive ones
-GAPS: Final = (1, 2, 4)  # steps in cycles between the two of a pair
 REACHES: Final = (1.5, 1.2, 0.9, 0.7, 0.5, 0.4, 0.4)  # reach of each step of a registration (m)
 LIMITS: Final = (FARTHEST, 0.5, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED, LEAST_SHARE)  # 0.5: least sum of weights
 SIGMA: Final = 0.15  # standard deviation of a coordinate (m), as the stated one may be wrong
@@ -46,7 +46,6 @@ FURTHER: Final = [
     for ring in (APART, 2.0 * APART, 3.0 * APART)
     for angle in np.arange(0.0, 2.0 * pi, APART / ring)
 ]
-DISTANCES: Final = [float(np.hypot(*start[:2])) for start in FURTHER]
 MATCHED: Final = 0.4  # least share of matched detections of a motion
 
 
@@ -69,13 +68,17 @@ def motions_of(
 
     Further starts are tried up to a speed `fastest` (m/s).
     """
-    cycles = [_nearest(cycle) for cycle in log.cycles if len(cycle.labels) >= fewest]
+    cycles = []  # each with its sixteen nearest detections
+    for cycle in log.cycles:
+        ranges = np.hypot(*cycle.points_vehicle.T)
+        if len(ranges) >= fewest:
+            cycles.append(cycle.where(ranges <= np.sort(ranges)[:16].max()))
     stamps = np.array([cycle.t for cycle in cycles])
     poses = dead_reckoned(log.odometry, stamps)
     # the two of a pair are at most half a second apart, unless cycles are rarer
     longest = max(0.55, 1.5 * float(np.median(np.diff(stamps)))) if len(stamps) > 1 else 0.0
     every, rows, tried = ceil(len(cycles) / most), list[Any](), 0
-    for gap in GAPS:
+    for gap in (1, 2, 4):  # cycles between the two of a pair
         twist = np.zeros(3)
         for k in range(len(cycles) - gap):
             dt = float(stamps[k + gap] - stamps[k])
@@ -97,11 +100,6 @@ def dead_reckoned(odometry: Odometry, stamps: Array) -> Array:
     return np.column_stack([np.interp(stamps, odometry.t, column) for column in odometry.poses().T])
 
 
-def _nearest(cycle: Detections) -> Detections:
-    ranges = np.hypot(*cycle.points_vehicle.T)
-    return cycle.where(ranges <= np.sort(ranges)[:16].max(initial=0.0))
-
-
 def register(
     before: Detections, after: Detections, starts: Sequence[Array], farthest: float, fewest: int
 ) -> tuple[float, Array, Array]:
@@ -110,11 +108,12 @@ def register(
     Where these starts match too little, further ones are tried, up to a distance (m).
     """
     best, variances = (0.0, np.zeros(3), np.zeros((3, 3))), np.full(len(after.labels), SIGMA**2)
-    for k, start in enumerate([*starts, *FURTHER[: np.searchsorted(DISTANCES, farthest)]]):
+    further = (far for far in FURTHER if np.hypot(*far[:2]) < farthest)
+    for k, start in enumerate(chain(starts, further)):
         if best[0] > (0.75 if k < len(starts) else MATCHED):
             break
         motion, information, matched, _ = kernels.matched(
-            before.points_vehicle, after.points_vehicle, variances, start, REACHES, LIMITS
+            before.points_vehicle, after.points_vehicle, variances, start, REACHES, LIMITS, (), np.zeros(0)
         )
         share = float(matched.sum()) / min(len(before.labels), len(after.labels))
         if matched.sum() >= fewest and share > best[0] + 0.1 * (best[0] > 0.0):

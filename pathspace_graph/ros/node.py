@@ -20,8 +20,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.convert import messages
-from pathspace_graph.convert.lines import along_lines, default_spacing
-from pathspace_graph.convert.recording import ASSUMED, beyond_limits, distinct, in_vehicle_frame, usable
+from pathspace_graph.convert.recording import (
+    ASSUMED,
+    along_lines,
+    beyond_limits,
+    default_spacing,
+    distinct,
+    in_vehicle_frame,
+    usable,
+)
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings
 from pathspace_graph.errors import PathspaceError, SettingsError
 from pathspace_graph.factors.arrays import Array
@@ -53,16 +60,11 @@ class MessageStream:
     def __init__(self, frames: Frames | None = None, wait: float = 0.0) -> None:
         self.frames, self.noise, self.rule = frames or Frames(), NoiseSettings(), LabelRule()
         self.refused: Counter[str] = Counter()  # number of messages for each reason
-        self._twists: deque[tuple[float, list[float]]] = deque(maxlen=10_000)
+        self.twists: deque[tuple[float, list[float]]] = deque(maxlen=10_000)
         self._first = np.inf  # the stamp (s) of the first twist
         self._wait = wait
         self._waiting = list[Detections]()  # in order of their stamps
         self._newest = -np.inf  # the stamp (s) of the newest message with detections
-
-    @property
-    def newest_twist(self) -> Array:
-        """The newest twist (3,) in m/s, m/s and rad/s."""
-        return np.array(self._twists[-1][1])
 
     def take_odometry(self, message: Any, received: float) -> bool:
         """Buffer the twist of a message that was received at this time (s); return whether it is usable."""
@@ -71,11 +73,11 @@ class MessageStream:
             if twist is None:
                 raise ValueError("odometry: expected a message with a twist, found a pose alone")
             twist = twist * self.frames.flip
-            if not np.isfinite([t, *twist]).all() or (self._twists and t <= self._twists[-1][0]):
+            if not np.isfinite([t, *twist]).all() or (self.twists and t <= self.twists[-1][0]):
                 raise ValueError("odometry: expected finite numbers and a stamp later than the one before")
             if beyond_limits(twist).any():  # an estimator would refuse each cycle that holds it
                 raise ValueError("odometry: expected a speed and a yaw rate that a vehicle can have")
-            self._twists.append((t, twist.tolist()))
+            self.twists.append((t, twist.tolist()))
             self._first = min(self._first, t)
         except messages.BROKEN as error:
             self.refused[str(error)] += 1
@@ -103,14 +105,14 @@ class MessageStream:
         insort(self._waiting, cycle, key=lambda one: one.t)
         while self._waiting and self._waiting[0].t <= self._newest - self._wait:
             cycle = self._waiting.pop(0)
-            rows = [row for row in self._twists if row[0] <= cycle.t]
+            rows = [row for row in self.twists if row[0] <= cycle.t]
             twists = np.array([twist for _, twist in rows]).reshape(-1, 3)
             yield Odometry(np.array([stamp for stamp, _ in rows]), twists), cycle
 
     def use(self, t: float) -> None:
         """Drop the twists that a cycle at t (s) has used, except the last one, which is held."""
-        while len(self._twists) > 1 and self._twists[1][0] <= t:
-            self._twists.popleft()
+        while len(self.twists) > 1 and self.twists[1][0] <= t:
+            self.twists.popleft()
 
 
 class Bridge:
@@ -147,7 +149,7 @@ class Bridge:
             self.body = messages.frame_id_of(message, "child_frame_id") or self.body
             if pose is not None and np.isfinite(pose).all():
                 self.frame = messages.frame_id_of(message)
-                self._odometry.append((t, pose, self.stream.newest_twist))
+                self._odometry.append((t, pose, np.array(self.stream.twists[-1][1])))
 
     def update(self, message: Any, received: float) -> CycleResult | None:
         """Map a message with detections, received at a time (s); return the last result, if any."""

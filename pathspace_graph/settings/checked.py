@@ -1,40 +1,29 @@
-"""Settings whose values are checked where they are made."""
+"""Settings whose values msgspec checks where they are made."""
 
-from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import MISSING, fields, is_dataclass
 from functools import cache
-from math import inf
-from numbers import Integral, Real
+from importlib import import_module
+from sys import float_info
 from types import NoneType, UnionType
 from typing import Annotated, Any, ClassVar, Final, Literal, Union, get_args, get_origin, get_type_hints
 
-from pathspace_graph.errors import SettingsError
+import msgspec
+from msgspec import Meta
 
-POSITIVE: Final = "a positive number"
-AT_LEAST_0: Final = "a number of at least 0"
-RULES: Final[dict[str, Callable[[Any], bool]]] = {  # checks of numbers, by the words of their message
-    POSITIVE: lambda value: 0 < value < inf,
-    "a positive number or inf": lambda value: value > 0,
-    AT_LEAST_0: lambda value: 0 <= value < inf,
-    "a number in [0, 1]": lambda value: 0 <= value <= 1,
-    "a number": lambda value: -inf < value < inf,
-}
-Unlimited = Annotated[float, "a positive number or inf"]
-AtLeast0 = Annotated[float, AT_LEAST_0]
-Share = Annotated[float, "a number in [0, 1]"]
-Signed = Annotated[float, "a number"]
+from pathspace_graph.errors import SettingsError, check_type
 
-_NUMBER_KINDS: Final[dict[Any, tuple[type[Any], str]]] = {
-    float: (Real, "a number"),
-    int: (Integral, "a whole number"),
-}
+LARGEST: Final = float_info.max  # largest finite number
+Positive = Annotated[float, Meta(gt=0.0, le=LARGEST, description="a positive number")]
+AtLeast0 = Annotated[float, Meta(ge=0.0, le=LARGEST, description="a number of at least 0")]
+Unlimited = Annotated[float, Meta(gt=0.0, description="a positive number or inf")]
+Share = Annotated[float, Meta(ge=0.0, le=1.0, description="a number in [0, 1]")]
+Signed = Annotated[float, Meta(ge=-LARGEST, le=LARGEST, description="a number")]
+Count = Annotated[int, Meta(gt=0, description="a positive whole number")]
+WORDS: Final[dict[Any, str]] = {float: "a number", int: "a whole number", bool: "True or False"}
 
 
 class Checked:
-    """Settings of the types that they declare, whose numbers keep the rule of their annotation.
-
-    A single number without a rule is positive and finite. A rule of a tuple holds for each of its numbers.
-    """
+    """Settings of the types that they declare; a single number without limits is positive and finite."""
 
     prefix: ClassVar[str]  # what stands before the names of the settings on the command line
 
@@ -42,56 +31,60 @@ class Checked:
         """Set the prefix from the name of the group, which is by default that of the class."""
         group = cls.__name__.removesuffix("Settings").lower() if group is None else group
         cls.prefix = f"{group}." if group else ""
+        setattr(cls, "__repr__", Checked._changed)  # noqa: B010 - or `dataclass` would make its own
+
+    def _changed(self) -> str:
+        """Call that makes these settings, with those that are not the default."""
+        changed = []
+        for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
+            value, make = getattr(self, entry.name), entry.default_factory
+            if value != (entry.default if make is MISSING else make()):
+                changed.append(f"{entry.name}={value!r}")
+        return f"{type(self).__name__}({', '.join(changed)})"
+
+    def _repr_html_(self) -> str | None:
+        found: str | None = import_module("pathspace_graph.io.brief").notebook_html(self)
+        return found
 
     def __post_init__(self) -> None:
         """Raise a SettingsError that names the first wrong setting, as the command line knows it."""
-        types = _types(type(self))  # type: ignore[arg-type]  # a class has a hash, whatever its heirs'
         for entry in fields(self):  # type: ignore[arg-type]  # every heir is a dataclass
-            value, (kind, stated) = getattr(self, entry.name), types[entry.name]
-            if not is_of(value, kind):
-                expected = f"expected {in_words(kind)}, found {value!r}"
-                raise SettingsError(f"{self.prefix}{entry.name}: {expected:.200}")
-            numbers = value if isinstance(value, tuple) else (value,)
-            rule = stated or ("" if isinstance(value, tuple) else POSITIVE)
-            for number in numbers:
-                if rule and is_of(number, float) and not RULES[rule](number):
-                    raise SettingsError(f"{self.prefix}{entry.name}: expected {rule}, found {number}")
+            as_setting(getattr(self, entry.name), type(self), entry.name, f"{self.prefix}{entry.name}")
+
+
+def as_setting(value: Any, settings: type[Any], name: str, where: str) -> Any:
+    """Convert plain data, or a number of NumPy, to the type of a setting; a SettingsError says `where`."""
+    kind = _types(settings)[name]  # type: ignore[arg-type]  # a class has a hash, whatever its heirs'
+    if is_dataclass(kind):
+        check_type(where, value, kind)  # type: ignore[arg-type]
+    listed = [value] if not isinstance(value, tuple) else [*value]
+    plain = [one.tolist() if hasattr(one, "tolist") else one for one in listed]
+    try:
+        return msgspec.convert(plain if isinstance(value, tuple) else plain[0], kind)
+    except (msgspec.ValidationError, OverflowError):
+        raise SettingsError(f"{where}: expected {_in_words(kind)}, found {value!r:.120}") from None
 
 
 @cache
-def _types(settings: Any) -> dict[str, tuple[Any, str]]:
-    """Type of each setting, and the rule of its annotation; empty without one."""
-    types = {}
-    for name, hint in get_type_hints(settings, include_extras=True).items():
-        kind, *stated = get_args(hint) if get_origin(hint) is Annotated else (hint,)
-        types[name] = kind, next((rule for rule in stated if isinstance(rule, str)), "")
+def _types(settings: type[Any]) -> dict[str, Any]:
+    """Type of each setting, with the default limits of the numbers where it is `Checked`."""
+    limits = {float: Positive, int: Count} if issubclass(settings, Checked) else {}
+    types, hints = {}, get_type_hints(settings, include_extras=True)
+    for entry in fields(settings):
+        hint = hints[entry.name]
+        parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+        types[entry.name] = Union[tuple(limits.get(part, part) for part in parts)]  # noqa: UP007
     return types
 
 
-def is_of(value: Any, kind: Any) -> bool:
-    """Whether a value is of the type of a field; NumPy's numbers are numbers."""
-    options = get_args(kind)
-    if get_origin(kind) in (Union, UnionType):
-        return any(is_of(value, option) for option in options)
+def _in_words(kind: Any) -> str:
+    parts = get_args(kind)
     if get_origin(kind) is Literal:
-        return value in options
+        return " or ".join(map(repr, parts))
     if get_origin(kind) is tuple:
-        each = options[:1] * len(value) if isinstance(value, tuple) and options[-1] is ... else options
-        return isinstance(value, tuple) and len(value) == len(each) and all(map(is_of, value, each))
-    if kind in _NUMBER_KINDS:
-        return isinstance(value, _NUMBER_KINDS[kind][0]) and not isinstance(value, bool)
-    return isinstance(value, get_origin(kind) or kind)
-
-
-def in_words(kind: Any) -> str:
-    options = get_args(kind)
-    if get_origin(kind) in (Union, UnionType):
-        return " or ".join(map(in_words, options))
-    if get_origin(kind) is Literal:
-        return " or ".join(map(repr, options))
-    if get_origin(kind) is tuple:
-        count = "" if options[-1] is ... else f"{len(options)} "
-        return f"a list of {count}values, each {in_words(options[0])}"
-    if kind in _NUMBER_KINDS:
-        return _NUMBER_KINDS[kind][1]
-    return {bool: "True or False", NoneType: "None"}.get(kind) or f"a {getattr(kind, '__name__', kind)}"
+        return f"a list of {'' if parts[-1] is ... else f'{len(parts)} '}values, each {_in_words(parts[0])}"
+    if get_origin(kind) is Annotated:
+        described = (part.description for part in parts if isinstance(part, Meta))
+        return next(described, None) or _in_words(parts[0])
+    words = " or ".join(_in_words(part) for part in parts if part is not NoneType)
+    return words or WORDS.get(kind) or f"a {getattr(kind, '__name__', kind)}"

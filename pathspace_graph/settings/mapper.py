@@ -17,7 +17,6 @@ from .online import (
     SidesSettings,
 )
 
-Knots = Literal["cones", "curvature"]  # what the knots of a closed boundary follow
 Start = Literal["auto", "online", "odometry"]
 
 
@@ -31,11 +30,9 @@ class SplineSettings(Checked):
     """Distance of neighbouring control points of an open, growing curve, m."""
     size_share: float = 0.43
     """Control points after closing as a share of the distinct cones that were detected (paper: 0.44)."""
-    knots: Knots = "cones"
-    """What the knots of a closed boundary follow. With `cones`, those at cones whose removal costs least are
-    removed. With `curvature` (paper: Simplification), cones are half as far again from the curve."""
     linear_baseline: float = 0.5
-    """Share of the knots that follow the curvature which is spread evenly along the curve."""
+    """Share of the knots of the paper's filter that is spread evenly along the curve; the others follow its
+    curvature."""
     sigma_model: float = 0.25
     """Standard deviation of a cone's distance from the curve, m, added in each detection. It is larger than
     the offsets, about 0.1 m, since a cone has the same one each time."""
@@ -105,20 +102,6 @@ class GateSettings(Checked):
 
 
 @dataclass(frozen=True)
-class FarSettings(Checked):
-    """The inactive part of the map, which is not solved for in every cycle.
-
-    What is inactive keeps its linearization: a closed map differs by millimetres to centimetres, an open one
-    by decimetres with `far.stretch`.
-    """
-
-    stretch: float = 12.0
-    """Least length behind the vehicle of which an open curve's control points become inactive, m."""
-    room: float = 40.0
-    """Length beyond what the vehicle sees that stays active, m, so that it need not change in every cycle."""
-
-
-@dataclass(frozen=True)
 class RelinearizeSettings(Checked):
     """Which factors of the window are relinearized in a step: those whose variables moved.
 
@@ -141,18 +124,10 @@ class OpenLapSettings(Checked, group="open_lap"):
 
     cycles: int = 20
     """Cycles after the return at which the batch closes the loop, or as many as the window holds."""
-    late: int = 100
-    """Most cycles by which a batch may be late, after which it is abandoned, as beyond `max_poses`."""
     ends: tuple[int, ...] = ()
     """Cycles in which the batches replace the prior in a replay: `batches.ends` of `summary.json`."""
     retry: float = 20.0
     """Least length of path from one batch of the lap to the next, where it does not agree (m)."""
-    max_cycles: Unlimited = 6000.0
-    """Most cycles of an open lap that is solved as a batch; a longer one stays open."""
-    max_cones: Unlimited = 1500.0
-    """Most cones of a lap that is solved as a batch, since with more it would not be in time."""
-
-    cycles_share: ClassVar[float] = 0.03  # of a long lap's cycles, which replaces `cycles` where it is more
 
 
 @dataclass(frozen=True)
@@ -225,7 +200,6 @@ class MapperSettings(Checked, group=""):
     growth: GrowthSettings = field(default_factory=GrowthSettings)
     closing: ClosingSettings = field(default_factory=ClosingSettings)
     open_lap: OpenLapSettings = field(default_factory=OpenLapSettings)
-    far: FarSettings = field(default_factory=FarSettings)
     relinearize: RelinearizeSettings = field(default_factory=RelinearizeSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)
     sides: SidesSettings = field(default_factory=SidesSettings)

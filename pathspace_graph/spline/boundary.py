@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from pathspace_graph.factors._kernels import Curves
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.bspline import SpanPolynomials
+from pathspace_graph.factors.bspline import SpanPolynomials, scatter
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.residuals import greville, smoothness_coefficients, smoothness_matrix
 from pathspace_graph.factors.se2 import move_points, path_lengths
@@ -138,14 +138,12 @@ class Boundary:
         """Find the foot points of points (m, 2) in the stretches [low, high], each (m,)."""
         s, curve = self.settings, np.zeros(len(points), np.intp)
         search = low, high, s.search_step, s.search_iterations
-        return FootPoints(*self._curve_from(low).search(control_points, points, curve, *search))
-
-    def _curve_from(self, low: Array) -> Curves:
-        """Curve on its distinct control points; an open one from the least limit (m,) on."""
         if self.periodic:
-            return Curves([self.tables], [0], [self.size])
-        first = int(self.tables.locate(np.min(low, initial=np.inf, keepdims=True))[0][0])
-        return Curves([self.tables.tail(first) if first else self.tables], [first])
+            curves = Curves([self.tables], [0], [self.size])
+        else:  # from the least limit on
+            first = int(self.tables.locate(np.min(low, initial=np.inf, keepdims=True))[0][0])
+            curves = Curves([self.tables.tail(first) if first else self.tables], [first])
+        return FootPoints(*curves.search(control_points, points, curve, *search))
 
     def find_anywhere(self, control_points: Array, points: Array) -> FootPoints:
         low, high = np.full((len(points), 2), [self.tables.low, self.tables.high]).T
@@ -179,9 +177,7 @@ class Boundary:
     def basis(self, u: Array) -> Array:
         """Weights (k, m) of the distinct control points at parameters (k,)."""
         (values,), span = self.tables.evaluate(u)
-        weights = np.zeros((len(u), self.size))
-        np.put_along_axis(weights, self.columns(span), values, axis=1)
-        return weights
+        return scatter(values, span - self.degree, self.size, self.periodic)
 
     def closed(self, knots: Array) -> "Boundary":
         """Make a closed boundary on periodic knots. It is confirmed, and its keys are new."""
@@ -307,7 +303,7 @@ def sampled(spline: BSpline, step: float) -> Array:
 
 def boundaries_cross(splines: Mapping[int, BSpline], step: float, path: Array = NO_PATH) -> bool:
     """Whether the boundaries, sampled at a step (m), cross elsewhere than where the path crosses itself."""
-    found = crossings(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
+    found = polyline_crossings(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
     return not at_level_crossing(found, path).all()
 
 
@@ -316,11 +312,11 @@ def at_level_crossing(points: Array, path: Array) -> BoolArray:
     if len(points) == 0 or len(path) < 2:
         return np.zeros(len(points), bool)
     _, kept = np.unique(path_lengths(path) // LEVEL_PATH_STEP, return_index=True)
-    places = KDTree(crossings(path[kept], path[kept], LEVEL_SINE))
+    places = KDTree(polyline_crossings(path[kept], path[kept], LEVEL_SINE))
     return np.asarray(places.query(points)[0] < LEVEL_CROSSING)
 
 
-def crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
+def polyline_crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
     """Points (k, 2) where two polylines cross at an angle of at least this sine."""
     i, j, share = crossing_segments(a, b)
     (p, q), (r, s) = (a[i], a[i + 1]), (b[j], b[j + 1])
@@ -447,9 +443,11 @@ def _crossings(label: int, lines: Mapping[int, _Way], drive: _Way, aside: float)
         rows, at, share = crossing_segments(drive.points[piece], line.points)
         order = np.argsort(rows + share)
         rows, at, share = rows[order] + piece.start, at[order], share[order]
-        between = rows.searchsorted(np.arange(piece.start, piece.stop))[deep[piece]]
-        loops = [k for k, ends in enumerate(pairwise(at), 1) if reaches[_between(*ends, line)].any()]
-        changes = _changes({*between.tolist(), *loops})
+        # parts of the drive, by the number of crossings before each, in which drive and curve move apart
+        apart = {*rows.searchsorted(np.arange(piece.start, piece.stop))[deep[piece]].tolist()}
+        apart |= {k for k, ends in enumerate(pairwise(at), 1) if reaches[_between(*ends, line)].any()}
+        # from one to the next, an odd number of crossings changes the side of the curve
+        changes = [a for a, b in pairwise(sorted(apart)) if (b - a) % 2]
         ends = [piece.start, *rows[changes].tolist(), piece.stop]
         for k, change in enumerate(changes):
             row, on_line = int(rows[change]), int(at[change])
@@ -457,9 +455,11 @@ def _crossings(label: int, lines: Mapping[int, _Way], drive: _Way, aside: float)
             one = Crossing(label, drive.points[row] + share[change] * step, float(drive.length[row]))
             leaves = (cross(line.heading[on_line], step) > 0.0) == (label == LEFT)
             beyond = slice(row + 1, ends[k + 2]) if leaves else slice(ends[k], row + 1)
-            is_last = k == (len(changes) - 1 if leaves else 0)
-            allowed = is_last and _is_off_road(label, lines, drive, beyond, aside)
-            allowed |= _meets_itself(one.place, drive, aside)
+            allowed = _meets_itself(one.place, drive, aside)
+            if k == (len(changes) - 1 if leaves else 0):  # off the road, the drive is along no other boundary
+                others = [(other, own) for other, own in lines.items() if other != label]
+                along = [_beside(*other, drive, beyond, aside).mean() for other in others]
+                allowed |= max(along, default=1.0) < ON_ROAD_SHARE
             allowed |= not line.closed and _is_of_another_lap(one, line.heading[on_line], drive, aside)
             if not allowed:
                 found.append(one)
@@ -472,21 +472,6 @@ def _between(first: int, second: int, line: _Way) -> IntArray:
     rows = np.arange(low + 1, high + 1)
     around = np.append(np.arange(high + 1, len(line.points)), np.arange(low + 1))
     return around if line.closed and len(around) < len(rows) else rows
-
-
-def _changes(deep: set[int]) -> list[int]:
-    """Return the crossings after which the vehicle is on the other side of a curve.
-
-    `deep` are the parts of the drive, by the number of crossings before each, in which drive and curve move
-    apart. From one to the next, an odd number of crossings changes the side.
-    """
-    return [a for a, b in pairwise(sorted(deep)) if (b - a) % 2]
-
-
-def _is_off_road(label: int, lines: Mapping[int, _Way], drive: _Way, beyond: slice, aside: float) -> bool:
-    """Whether the drive beyond a boundary is along no other boundary, as before it enters the road."""
-    others = [_beside(other, line, drive, beyond, aside) for other, line in lines.items() if other != label]
-    return bool(others) and max(float(one.mean()) for one in others) < ON_ROAD_SHARE
 
 
 def _beside(label: int, line: _Way, drive: _Way, rows: slice, aside: float) -> BoolArray:

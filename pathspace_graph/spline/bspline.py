@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import ClassVar, Final, Self
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
@@ -22,6 +23,10 @@ _PERIODIC_TOLERANCE: Final = 1e-9  # largest difference of repeated values, rela
 _FOOT_GRID: Final = 8  # grid points on each span of a foot-point search over the whole curve
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
 _ARC_NEWTON_STEPS: Final = 4  # Newton steps that invert the arc length, from a table on the same grid
+_BERNSTEIN: Final = np.array(
+    [[1.0, 0.0, 0.0, 0.0], [-3.0, 3.0, 0.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]
+)
+"""Coefficients (power, basis function) of the cubic Bernstein polynomials."""
 _SHORTEST_EXTENSION: Final = 1e-3  # shortest new knot interval, relative to the mean one
 
 
@@ -115,6 +120,20 @@ class BSpline:
             )
         unwrapped = np.concatenate([control_points, control_points[:degree]])
         return cls(periodic_knots(breaks, degree), unwrapped, degree, periodic=True)
+
+    @classmethod
+    def hermite(cls, u: Array, points: Array, slopes: Array) -> Self:
+        """Build the cubic curve through points (k, 2) at parameters u (k,), with slopes dS/du (k, 2) there.
+
+        It has a Bernstein basis on each span: all knots are triple.
+        """
+        third, count = np.diff(u)[:, None] / 3.0, len(u) - 1
+        before, after = points[:-1] + third * slopes[:-1], points[1:] - third * slopes[1:]
+        pieces = np.stack([points[:-1], before, after], axis=1)
+        knots = np.concatenate([u[:1], np.repeat(u, 3), u[-1:]])
+        basis = np.broadcast_to(_BERNSTEIN[:, None], (4, 3 * count - 2, 4))
+        control_points = np.concatenate([pieces.reshape(-1, cls.DIMENSION), points[-1:]])
+        return cls.on(SpanPolynomials(knots, 3, False, basis), control_points)
 
     @classmethod
     def on(cls, tables: SpanPolynomials, control_points: Array) -> Self:
@@ -334,6 +353,12 @@ def _blossom(knots: Array, degree: int, span: int, arguments: Array) -> Array:
         share = ((x - lower) / (upper - lower))[:, None]
         weights = (1.0 - share) * weights[:-1] + share * weights[1:]
     return np.asarray(weights[0])
+
+
+def sparse_rows(values: Array, columns: IntArray, size: int) -> csr_array:
+    """Build a sparse matrix (k, size) from the values (k, ...) and columns of each row."""
+    ends = np.arange(len(values) + 1) * (values.size // len(values))
+    return csr_array((values.ravel(), columns.ravel(), ends), shape=(len(values), size))
 
 
 def dot(a: Array, b: Array) -> Array:

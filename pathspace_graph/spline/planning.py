@@ -1,115 +1,55 @@
-"""Input of a planner: a centre line with widths, curvature and sigmas, and a speed profile."""
+"""Input of planners and controllers: the centre line of a map, the next metres of it, and a speed profile."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from math import sqrt
-from typing import TYPE_CHECKING, Final
+from math import ceil, floor, sqrt
+from numbers import Real
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import left_of
+from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.bspline import SpanPolynomials
+from pathspace_graph.factors.footpoint import foot_points
+from pathspace_graph.factors.se2 import left_of, path_lengths, to_vehicle, wrap_angle
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.settings.output import SpeedSettings
 
-from .ahead import LEAST_STEP, MOST_POINTS, TrackAhead, check_length
-from .bspline import BSpline, cross, dot
-from .centre_line import RIBBON, CentreCurve, Crossing, find_line, sparse_rows
+from .bspline import BSpline, cross, dot, sparse_rows
+from .centre_line import (
+    RIBBON,
+    SAMPLE_STEP,
+    CentreCurve,
+    NormalCrossing,
+    SampledBoundary,
+    find_line,
+    paired,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-@dataclass(frozen=True, eq=False)
-class SpeedProfile:
-    """Speed at the n points of a line."""
-
-    speed: Array
-    """Speed (n,) in m/s."""
-    acceleration: Array
-    """Acceleration (n,) from each point to the next, in m/s^2; 0 at the last point of an open line."""
-    time: Array
-    """Time (n,) since the first point, in s."""
-    duration: float
-    """Time for the whole line (s): the lap time of a closed one."""
+LEAST_STEP: Final = 0.01  # least distance of the points of a line (m)
+MOST_POINTS: Final = 200_000  # largest number of points of a line; bounds the memory
 
 
-def speed_profile(
-    line: CentreLine | TrackAhead,
-    settings: SpeedSettings | None = None,
-    begin: float | None = None,
-    end: float | None = None,
-) -> SpeedProfile:
-    """Compute the largest speeds with v <= v_top on the friction ellipse
-
-        (v^2 k / a_lateral)^2 + (a / a_long)^2 <= 1,
-
-    with the curvature k, and the acceleration a, constant from each point to the next one. Each such step
-    obeys it at its slower end. a_long is `forward` or `braking`. The pass of the curvature sets
-    v^2 = a_lateral / |k|; a forward and a backward pass bound v_next^2 by v^2 + 2 a ds (Kapania et al., J.
-    Dyn. Syst. Meas. Control 138, 2016). A closed line begins and ends at the same speed, an open one at the
-    given speeds (m/s), by default as fast as its curvature allows. SettingsError for fewer than two points,
-    or an impossible speed.
-    """
-    settings = settings or SpeedSettings()
-    _check_ends(line, begin, end)
-    count, steps = len(line.curvature), np.diff(line.arc_length)
-    bend = np.abs(line.curvature) / settings.lateral
-    squares = np.minimum(1.0 / np.maximum(bend, np.finfo(float).tiny), settings.top**2)
-    if line.closed:  # begin and end at the slowest point
-        first = int(squares.argmin())
-        around = np.arange(first, first + count + 1) % count
-        steps = np.append(steps, line.length - line.arc_length[-1])[around[:-1]]
-        squares, bend = squares[around], bend[around]
-    for at, limit in ((0, begin), (-1, end)):
-        squares[at] = squares[at] if limit is None else min(squares[at], limit**2)
-    squares = _accelerated(squares, steps, bend, settings.forward)
-    squares = _accelerated(squares[::-1], steps[::-1], bend[::-1], settings.braking)[::-1]
-    acceleration, speed = 0.5 * np.diff(squares) / steps, np.sqrt(squares)
-    sums = speed[:-1] + speed[1:]
-    seconds = np.divide(2.0 * steps, sums, out=np.full(len(steps), np.inf), where=sums > 0.0)
-    if line.closed:
-        columns = speed[:-1], acceleration, seconds
-        speed, acceleration, seconds = (np.roll(column, first) for column in columns)
-    else:
-        acceleration = np.append(acceleration, 0.0)
-    time = np.append(0.0, np.cumsum(seconds))
-    return SpeedProfile(speed, acceleration, time[:count], float(time[-1]))
-
-
-def _check_ends(line: CentreLine | TrackAhead, begin: float | None, end: float | None) -> None:
-    limits, where = [limit for limit in (begin, end) if limit is not None], "a speed profile: expected"
-    if len(line.curvature) < 2:
-        raise SettingsError(f"{where} a line of at least 2 points, found {len(line.curvature)}")
-    if line.closed and limits:
-        raise SettingsError(f"{where} an open line for a begin or end speed, found a loop")
-    for limit in limits:
-        if not 0.0 <= limit < np.inf:
-            raise SettingsError(f"{where} a speed (m/s) of at least 0, found {limit:g}")
-
-
-def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Array:
-    """Limit squared speeds (n,) to what an acceleration of at most `most` (m/s^2) reaches along the line."""
-    reached, now = squares.tolist(), float(squares[0])
-    for i, (step, turn) in enumerate(zip(steps.tolist(), bend[:-1].tolist(), strict=True), 1):
-        share = sqrt(max(1.0 - (now * turn) ** 2, 0.0))
-        now = reached[i] = min(reached[i], now + 2.0 * most * share * step)
-    return np.array(reached)
-
-
-_FEWEST_POINTS: Final = 4  # smallest number of points of a line
-_NORMALS_APART: Final = 10  # largest number of points between normals that must not cross
-_WIDTH_SHARE: Final = 0.95  # largest width, as a share of the distance to where two normals cross
+def check_length(name: str, length: float, least: float = 0.0) -> None:
+    """Raise a SettingsError unless a length (m) is positive and at least `least`."""
+    if isinstance(length, Real) and least <= length < np.inf and length > 0.0:
+        return
+    expected = f"a number of at least {least:g} m" if least else "a positive number (m)"
+    found = f"{float(length):g}" if isinstance(length, Real) else repr(length)
+    raise SettingsError(f"{name}: expected {expected}, found {found}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CentreLine:
-    """Smooth centre line of a track (`find_line`) at n evenly spaced points, map frame.
-
-    Standard deviations are those of the point where the line crosses its normal; NaN without covariance.
-    """
+class Line:
+    """Centre line at n points."""
 
     points: Array
     """Points (n, 2) in m; a closed line does not repeat the first one."""
@@ -120,9 +60,26 @@ class CentreLine:
     arc_length: Array
     """Length (n,) of the line from its first point, in m."""
     width_left: Array
-    """Distance (n,) along the normal to the left boundary (m); shortened if normals would cross."""
+    """Distance (n,) along the normal to the left boundary, in m."""
     width_right: Array
-    """Distance (n,) along the normal to the right boundary (m), shortened likewise."""
+    """Distance (n,) along the normal to the right boundary, in m."""
+
+
+# --- the centre line of a map ----------------------------------------------------------------------------
+
+_FEWEST_POINTS: Final = 4  # smallest number of points of a line
+_NORMALS_APART: Final = 10  # largest number of points between normals that must not cross
+_WIDTH_SHARE: Final = 0.95  # largest width, as a share of the distance to where two normals cross
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CentreLine(Line):
+    """Smooth centre line of a track (`find_line`) at n evenly spaced points, map frame.
+
+    Widths are shortened where normals would meet. Standard deviations are those of the point where the line
+    crosses its normal; NaN without covariance.
+    """
+
     closed: bool
     """Whether the line is a loop."""
     length: float
@@ -214,7 +171,9 @@ def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) 
     return [left, right]
 
 
-def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: Array | None) -> list[Array]:
+def _sigmas(
+    line: CentreCurve, u: Array, crossings: list[NormalCrossing], covariance: Array | None
+) -> list[Array]:
     """Standard deviations (n,) across the line, and of heading, curvature, arc length and both widths.
 
     Each is that of the point where the line crosses its old normal at u (n,). With dC = B dc, and the shift
@@ -253,3 +212,270 @@ def _sigmas(line: CentreCurve, u: Array, crossings: list[Crossing], covariance: 
 def _along(a: Array, moved: Array) -> Array:
     """Derivatives `a . dC` (n, M), of vectors a (n, 2) and derivatives (n, 2, M)."""
     return np.asarray(np.einsum("kd,kdm->km", a, moved))
+
+
+# --- the next metres of a drive --------------------------------------------------------------------------
+
+_SAMPLES_BEHIND: Final = 3.0  # distance of the first sample behind the vehicle (m), which may stand askew
+_OUTER_LENGTH: Final = 1.8  # largest length of a turn's outer boundary, relative to the centre line
+_PAIR_STARTS: Final = 16  # number of samples of the left boundary at which the pairs may begin
+_STRIDE: Final = 2  # stride of the samples that are paired
+_SETTLING_STEPS: Final = 8  # largest number of Newton steps of a line; two are mostly enough
+_SETTLED: Final = 1e-3  # largest difference of the distances from both boundaries on the line (m)
+_LARGEST_GAP: Final = 2.0  # largest distance of neighbours, in steps
+
+
+@dataclass(frozen=True, eq=False)
+class CurveAhead:
+    """A boundary in the direction of travel, and the vehicle's place on it."""
+
+    tables: SpanPolynomials  # basis; its parameter is about a length in m
+    control_points: Array  # (n, 2) in m, map frame; unwrapped if the curve is closed
+    beside: float  # parameter near the vehicle's foot point
+    until: float = np.inf  # parameter up to which an open curve is confirmed
+    tentative: Array | None = None
+    """(k, 2) Points through which the boundary may continue from its end (m, map frame)."""
+    confirmed: bool = True  # whether the curve can no longer be taken back
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TrackAhead(Line):
+    """The next stretch of the track in the vehicle's frame (x forward, y left, m and rad).
+
+    The points of the centre line are equally far from both boundaries; the first one is beside the vehicle.
+    There are none if only one boundary is known, and fewer than requested if the map ends before.
+    """
+
+    confirmed: BoolArray
+    """Whether both boundaries are confirmed at each point (n,); other points may still change."""
+    left: Array
+    """Points (k, 2) of the left boundary from beside the vehicle on, in m."""
+    right: Array
+    """Points (h, 2) of the right boundary from beside the vehicle on, in m."""
+    closed: ClassVar[bool] = False
+    """The track ahead is an open stretch, also on a closed track."""
+
+    def __repr__(self) -> str:
+        return f"TrackAhead({len(self.points)} points on {self.length:.1f} m)"
+
+    @property
+    def length(self) -> float:
+        """Length of the known centre line (m)."""
+        return float(self.arc_length[-1]) if len(self.arc_length) else 0.0
+
+
+def check_line(distance: float, step: float) -> None:
+    """Raise a SettingsError unless distance and step (m) are in range."""
+    check_length("step", step, LEAST_STEP)
+    check_length("distance", distance)
+    check_length("step", step, distance / MOST_POINTS)
+
+
+def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, step: float) -> TrackAhead:
+    """Return the next `distance` metres from a pose (x, y, theta), at points `step` (m) apart.
+
+    `curves` are the known boundaries by label. The lengths have passed `check_line`. Newton steps move the
+    midpoints of samples that face each other (`paired`) until both boundaries are equally far.
+    """
+    known = {label: _stretch(curve, distance) for label, curve in curves.items()}
+    sides = {label: np.zeros((0, 2)) for label in BOUNDARIES}
+    for label, stretch in known.items():
+        first, last = stretch.u.searchsorted([-_SETTLED, distance + _SETTLED])
+        sides[label] = to_vehicle(stretch.points[first:last], pose[None])
+    no, none = np.zeros(0), np.zeros((0, 2))
+    nothing = TrackAhead(none, no, no, no, no, no, no > 0.0, sides[LEFT], sides[RIGHT])
+    if len(known) < len(BOUNDARIES):
+        return nothing
+    stretches = known[LEFT], known[RIGHT]
+    i, j = paired(*stretches, _PAIR_STARTS)
+    if len(i) < 2:
+        return nothing
+    (left, first), (right, second) = stretches[0].at(i), stretches[1].at(j)
+    pairs = np.column_stack([0.5 * (left + right), first, second])
+    # the pairs advance on one side at a time: without the mean of two, their midpoints zigzag
+    pairs = np.concatenate([pairs[:1], 0.5 * (pairs[1:] + pairs[:-1]), pairs[-1:]])
+    points, *places = _from_beside(pairs, pose[:2], distance, step)
+    for _ in range(_SETTLING_STEPS):
+        feet = [
+            foot_points(one.spline.tables, one.spline.control_points, points, u - step, u + step, SAMPLE_STEP)
+            for one, u in zip(stretches, places, strict=True)
+        ]
+        places = [foot.u for foot in feet]
+        off, both = feet[0].distance + feet[1].distance, feet[0].normal_unit + feet[1].normal_unit
+        inside = feet[0].interior & feet[1].interior
+        if not inside.all():  # a point may lie a little past the end of a boundary
+            beyond = np.abs([dot(points - foot.position, foot.tangent_unit) for foot in feet])
+            inside = np.asarray((beyond <= 0.5 * SAMPLE_STEP).all(axis=0))
+        if not (inside & (np.abs(off) > _SETTLED)).any():
+            break
+        points = points - (off / np.maximum(dot(both, both), np.finfo(float).tiny))[:, None] * both
+    good = inside & (np.abs(off) <= _SETTLED) & (feet[0].distance < 0.0) & (feet[1].distance > 0.0)
+    steps = np.append(0.0, np.hypot(*np.diff(points, axis=0).T))
+    good &= steps <= _LARGEST_GAP * step
+    n = len(good) if good.all() else int(good.argmin())
+    points, normal = points[:n], both[:n] / np.hypot(*both[:n].T)[:, None]
+    heading = np.arctan2(-normal[:, 0], normal[:, 1]) - pose[2]
+    half_turn = 0.5 * wrap_angle(np.diff(heading, prepend=heading[:1]))
+    widths, bends, confirmed = [], [], np.ones(n, bool)
+    for stretch, foot in zip(stretches, feet, strict=True):
+        u, d = foot.u[:n], foot.distance[:n]
+        k = np.interp(u, stretch.u, stretch.curvature)
+        bends.append(k / (1.0 - k * d))  # of the parallel curve through each point
+        # the normal of the line crosses the osculating circle where k w^2 + 2 w half = rest
+        half, rest = dot(normal, foot.normal_unit[:n]) * (1.0 - k * d), (2.0 - k * d) * d
+        widths.append(np.abs(rest) / (np.abs(half) + np.sqrt(np.maximum(half**2 + k * rest, 0.0))))
+        confirmed &= u <= stretch.confirmed_end
+    return TrackAhead(
+        points=to_vehicle(points, pose[None]),
+        heading=wrap_angle(heading),
+        curvature=0.5 * dot(normal, feet[0].normal_unit[:n]) * (bends[0] + bends[1]),
+        arc_length=np.cumsum(steps[:n] / np.sinc(half_turn / np.pi)),  # along circular arcs
+        width_left=widths[0],
+        width_right=widths[1],
+        confirmed=confirmed,
+        left=sides[LEFT],
+        right=sides[RIGHT],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Stretch(SampledBoundary):
+    """Samples of a boundary whose parameter is 0 beside the vehicle."""
+
+    curvature: Array  # (n,) in 1/m
+    confirmed_end: float  # parameter up to which it is confirmed
+
+
+def _stretch(curve: CurveAhead, distance: float) -> _Stretch:
+    """Sample a boundary from behind the vehicle on.
+
+    The cubic through the samples, and through tentative points with the slopes of a Catmull-Rom spline,
+    differs from the curve by far less than a mm.
+    """
+    tables, beside = curve.tables, curve.beside
+    begin, end = beside - _SAMPLES_BEHIND, beside + _OUTER_LENGTH * distance + _SAMPLES_BEHIND
+    if tables.periodic:
+        end = min(end, begin + tables.length)  # at most one period
+    else:
+        end = min(end, tables.high, curve.until)
+        begin = min(max(begin, tables.low), end - SAMPLE_STEP)
+    # put a sample beside the vehicle, unless the curve begins or ends there
+    low, high = (begin - beside) / SAMPLE_STEP + _SETTLED, (end - beside) / SAMPLE_STEP - _SETTLED
+    u = SAMPLE_STEP * np.arange(floor(low), ceil(high) + 1, dtype=np.float64)
+    u[[0, -1]] = begin - beside, end - beside
+    values, span = tables.evaluate(beside + u, 2)
+    columns = span[:, None] + np.arange(-tables.degree, 1)
+    places = np.einsum("rkj,kjd->rkd", values, curve.control_points[columns])
+    nodes, (points, slopes, _), end = u, places, float(u[-1])
+    tentative = curve.tentative if curve.tentative is not None else points[:0]
+    if len(tentative):
+        edges = np.diff(np.concatenate([points[-1:], tentative]), axis=0)
+        lengths = np.hypot(*edges.T)
+        unit, share = edges / lengths[:, None], (lengths[:-1] / (lengths[:-1] + lengths[1:]))[:, None]
+        slopes = np.concatenate([slopes, unit[:-1] * (1.0 - share) + unit[1:] * share, unit[-1:]])
+        points, nodes = np.concatenate([points, tentative]), np.append(u, end + np.cumsum(lengths))
+    spline = BSpline.hermite(nodes, points, slopes)
+    if len(tentative):
+        beyond = np.linspace(end, nodes[-1], ceil((nodes[-1] - end) / SAMPLE_STEP) + 1)[1:]
+        u, places = np.append(u, beyond), np.concatenate([places, spline.derivatives(beyond, 2)], axis=1)
+    some = np.append(np.arange(0, len(u) - 1, _STRIDE), len(u) - 1)
+    u, (points, first, second) = u[some], places[:, some]
+    curvature = cross(first, second) / np.hypot(*first.T) ** 3
+    return _Stretch(spline, u, u, points, first, curvature, end if curve.confirmed else -np.inf)
+
+
+def _from_beside(line: Array, position: Array, distance: float, step: float) -> list[Array]:
+    """Resample a line of points and parameters (n, 4) at even steps, from beside a position (2,) on.
+
+    The results are points (k, 2), and the two parameters (k,) of each.
+    """
+    edges, offset = np.diff(line[:, :2], axis=0), position - line[:-1, :2]
+    squares = np.maximum(dot(edges, edges), np.finfo(float).tiny)
+    share = np.clip(dot(offset, edges) / squares, 0.0, 1.0)
+    away = offset - share[:, None] * edges
+    nearest, lengths = int(dot(away, away).argmin()), path_lengths(line)
+    begin = lengths[nearest] + share[nearest] * (lengths[nearest + 1] - lengths[nearest])
+    count = int(min(distance, lengths[-1] - begin) / step + _SETTLED)
+    at = begin + step * np.arange(count + 1)
+    x, y, *places = (np.interp(at, lengths, values) for values in line.T)
+    return [np.column_stack([x, y]), *places]
+
+
+# --- speed -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class SpeedProfile:
+    """Speed at the n points of a line."""
+
+    speed: Array
+    """Speed (n,) in m/s."""
+    acceleration: Array
+    """Acceleration (n,) from each point to the next, in m/s^2; 0 at the last point of an open line."""
+    time: Array
+    """Time (n,) since the first point, in s."""
+    duration: float
+    """Time for the whole line (s): the lap time of a closed one."""
+
+
+def speed_profile(
+    line: CentreLine | TrackAhead,
+    settings: SpeedSettings | None = None,
+    begin: float | None = None,
+    end: float | None = None,
+) -> SpeedProfile:
+    """Compute the largest speeds with v <= v_top on the friction ellipse
+
+        (v^2 k / a_lateral)^2 + (a / a_long)^2 <= 1,
+
+    with the curvature k, and the acceleration a, constant from each point to the next one. Each such step
+    obeys it at its slower end. a_long is `forward` or `braking`. The pass of the curvature sets
+    v^2 = a_lateral / |k|; a forward and a backward pass bound v_next^2 by v^2 + 2 a ds (Kapania et al., J.
+    Dyn. Syst. Meas. Control 138, 2016). A closed line begins and ends at the same speed, an open one at the
+    given speeds (m/s), by default as fast as its curvature allows. SettingsError for fewer than two points,
+    or an impossible speed.
+    """
+    settings = settings or SpeedSettings()
+    _check_ends(line, begin, end)
+    count, steps = len(line.curvature), np.diff(line.arc_length)
+    bend = np.abs(line.curvature) / settings.lateral
+    squares = np.minimum(1.0 / np.maximum(bend, np.finfo(float).tiny), settings.top**2)
+    if line.closed:  # begin and end at the slowest point
+        first = int(squares.argmin())
+        around = np.arange(first, first + count + 1) % count
+        steps = np.append(steps, line.length - line.arc_length[-1])[around[:-1]]
+        squares, bend = squares[around], bend[around]
+    for at, limit in ((0, begin), (-1, end)):
+        squares[at] = squares[at] if limit is None else min(squares[at], limit**2)
+    squares = _accelerated(squares, steps, bend, settings.forward)
+    squares = _accelerated(squares[::-1], steps[::-1], bend[::-1], settings.braking)[::-1]
+    acceleration, speed = 0.5 * np.diff(squares) / steps, np.sqrt(squares)
+    sums = speed[:-1] + speed[1:]
+    seconds = np.divide(2.0 * steps, sums, out=np.full(len(steps), np.inf), where=sums > 0.0)
+    if line.closed:
+        columns = speed[:-1], acceleration, seconds
+        speed, acceleration, seconds = (np.roll(column, first) for column in columns)
+    else:
+        acceleration = np.append(acceleration, 0.0)
+    time = np.append(0.0, np.cumsum(seconds))
+    return SpeedProfile(speed, acceleration, time[:count], float(time[-1]))
+
+
+def _check_ends(line: CentreLine | TrackAhead, begin: float | None, end: float | None) -> None:
+    limits, where = [limit for limit in (begin, end) if limit is not None], "a speed profile: expected"
+    if len(line.curvature) < 2:
+        raise SettingsError(f"{where} a line of at least 2 points, found {len(line.curvature)}")
+    if line.closed and limits:
+        raise SettingsError(f"{where} an open line for a begin or end speed, found a loop")
+    for limit in limits:
+        if not 0.0 <= limit < np.inf:
+            raise SettingsError(f"{where} a speed (m/s) of at least 0, found {limit:g}")
+
+
+def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Array:
+    """Limit squared speeds (n,) to what an acceleration of at most `most` (m/s^2) reaches along the line."""
+    reached, now = squares.tolist(), float(squares[0])
+    for i, (step, turn) in enumerate(zip(steps.tolist(), bend[:-1].tolist(), strict=True), 1):
+        share = sqrt(max(1.0 - (now * turn) ** 2, 0.0))
+        now = reached[i] = min(reached[i], now + 2.0 * most * share * step)
+    return np.array(reached)

@@ -47,7 +47,7 @@ def test_a_course_that_is_driven_again_is_closed() -> None:
     """The detections of both laps lie on its curves."""
     judged = judge_log(driven(1.4), driven(1.4).noise, SETTINGS)
     detections = DetectionTable.of(judged.cycles, twists=judged.chain.twists)
-    system = BatchSystem(detections, judged.chain, SETTINGS, find_revisits(judged))
+    system = BatchSystem(detections, [judged.chain], [SETTINGS], find_revisits(judged))
     found = find_closed_optimum(Optimizer(system))
     assert found is not None
     at = found.at

@@ -102,7 +102,7 @@ def test_what_is_aligned_is_a_minimum_of_odometry_and_revisits() -> None:
 
 def test_the_curves_of_a_closed_course_stand_beside_its_path() -> None:
     log, chain = drifting()
-    state = start_odometry(BatchSystem(DetectionTable.of(log.cycles), chain, SETTINGS, revisits()))
+    state = start_odometry(BatchSystem(DetectionTable.of(log.cycles), [chain], [SETTINGS], revisits()))
     assert set(state.boundaries) == set(BOUNDARIES)
     assert log.truth is not None
     for label, boundary in state.boundaries.items():
@@ -118,7 +118,7 @@ def test_a_path_without_a_revisit_is_dead_reckoned() -> None:
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, 5.0), cones, labels)
     chain = judge_log(log, log.noise, SETTINGS).chain
-    state = start_odometry(BatchSystem(DetectionTable.of(log.cycles), chain, SETTINGS))
+    state = start_odometry(BatchSystem(DetectionTable.of(log.cycles), [chain], [SETTINGS]))
     np.testing.assert_allclose(state.poses, chain.dead_reckoned(np.zeros(2)), atol=1e-9)
     np.testing.assert_allclose(state.variables.calibration, 0.0, atol=1e-9)
     for label, y in ((LEFT, 2.0), (RIGHT, -2.0)):
@@ -129,6 +129,6 @@ def test_a_path_without_a_revisit_is_dead_reckoned() -> None:
 def test_a_circuit_of_21_metres_has_both_boundaries() -> None:
     log = exact_log(ahead(6.0, 5.0), *corridor(60.0, half_width=10.5))
     chain = judge_log(log, log.noise, SETTINGS).chain
-    state = start_odometry(BatchSystem(DetectionTable.of(log.cycles), chain, SETTINGS))
+    state = start_odometry(BatchSystem(DetectionTable.of(log.cycles), [chain], [SETTINGS]))
     for label, y in ((LEFT, 10.5), (RIGHT, -10.5)):
         np.testing.assert_allclose(state.control_points(label)[:, 1], y, atol=1e-6)

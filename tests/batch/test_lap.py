@@ -55,7 +55,7 @@ def open_lap(settings: MapperSettings | None = None) -> OpenLap:
     splines = {}
     for label in BOUNDARIES:
         cones = truth.cones[truth.cone_labels == label]
-        splines[label] = fit_spline(cones, len(cones) // 2, periodic=True)
+        splines[label] = fit_spline(cones, len(cones) // 2, periodic=True)[0]
     return OpenLap(
         settings=settings,
         chain=judge_log(drive, drive.noise, settings).chain,

@@ -13,13 +13,13 @@ from pathspace_graph.batch.optimizer import (
     GATE_FACTOR,
     LOOSE_GATE,
     TOLERANCE_DECREASE,
-    Effort,
     Optimizer,
+    Stage,
     extrapolation_factor,
     predicted_decrease,
 )
 from pathspace_graph.batch.system import BatchSystem, Evaluation
-from pathspace_graph.graph.elimination import Damping
+from pathspace_graph.graph.elimination import Damping, solution
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -39,6 +39,14 @@ def noisy() -> tuple[BatchSystem, State]:
     return drawn(exact, np.random.default_rng(3))[0], truth
 
 
+def test_the_schedule_of_open_curves_has_no_stations_and_ends_with_the_tight_gate() -> None:
+    system, state = noisy()
+    first, last = Optimizer(system).schedule(state)
+    assert (first.gate, first.refit, last.gate, last.refit) == (LOOSE_GATE, True, BATCH.gate, True)
+    assert first.tolerance > last.tolerance
+    assert not (first.stations or last.stations)
+
+
 # --- rounds ----------------------------------------------------------------------------------------------
 
 
@@ -46,8 +54,8 @@ def test_the_gate_shrinks_by_its_factor_to_its_last_value() -> None:
     """Only with the last gate may the optimization end, however little has changed before."""
     system, state = noisy()
     gates: list[float] = []
-    optimizer = Optimizer(system, Effort(tolerance=1e9), lambda: gates.append(system.kernel.gate))
-    _, convergence = optimizer.run(state, gate=8.0, rounds=12)
+    optimizer = Optimizer(system, on_round=lambda: gates.append(system.kernel.gate))
+    _, convergence = optimizer.run(state, Stage(8.0, 12, 1e9))
     expected = [8.0 * GATE_FACTOR**k for k in range(2)] + [BATCH.gate]
     np.testing.assert_allclose(gates, expected)
     assert convergence.converged
@@ -57,26 +65,25 @@ def test_the_gate_shrinks_by_its_factor_to_its_last_value() -> None:
 def test_it_ends_where_nothing_changes_any_more() -> None:
     """The gradient is small there, and another run changes neither cost nor curves."""
     system, state = noisy()
-    at, convergence = Optimizer(system).run(state, BATCH.gate, 40)
+    at, convergence = Optimizer(system).run(state, Stage(BATCH.gate, 40))
     assert convergence.converged
     assert convergence.cost == at.cost
     assert convergence.steps >= convergence.rounds
-    again, _ = Optimizer(system).run(at.state, BATCH.gate, 40)
+    again, _ = Optimizer(system).run(at.state, Stage(BATCH.gate, 40))
     np.testing.assert_allclose(again.cost, at.cost, rtol=1e-4)
     np.testing.assert_allclose(again.state.poses, at.state.poses, atol=5e-3)
 
 
 def decrease_and_step(system: BatchSystem, at: Evaluation) -> tuple[float, Array]:
     """Returns the undamped step at a state, and the decrease of the cost that it predicts."""
-    problem = system.eliminated(at)
-    step = problem.step(np.zeros(problem.map.size))
+    step = solution(system.linear_graph(at), at.state.variables.layout)
     return predicted_decrease(system.rows(at), at.state.variables.layout, step), step
 
 
 def test_the_predicted_decrease_is_that_of_a_linear_problem() -> None:
     """Near the optimum an undamped step makes the cost smaller by just that: `1/2 g' H^-1 g`."""
     system, state = noisy()
-    at, _ = Optimizer(system).run(state, BATCH.gate, 40)
+    at, _ = Optimizer(system).run(state, Stage(BATCH.gate, 40))
     off = np.random.default_rng(4).normal(0.0, 1e-3, len(at.state.variables.values))
     beside = system.evaluate(system.retract(at.state, off))
     predicted, step = decrease_and_step(system, beside)
@@ -89,7 +96,7 @@ def test_the_predicted_decrease_is_that_of_a_linear_problem() -> None:
 def test_it_ends_with_a_step_of_a_small_part_of_a_sigma() -> None:
     """The next one would be shorter."""
     system, state = noisy()
-    at, convergence = Optimizer(system).run(state, BATCH.gate, 40)
+    at, convergence = Optimizer(system).run(state, Stage(BATCH.gate, 40))
     assert convergence.gradient <= np.sqrt(2.0 * TOLERANCE_DECREASE)
     assert np.sqrt(2.0 * decrease_and_step(system, at)[0]) < convergence.gradient
 
@@ -103,7 +110,7 @@ def test_associations_that_hardly_change_are_searched_no_more(monkeypatch: pytes
 
     monkeypatch.setattr("pathspace_graph.batch.optimizer.associate", counted)
     system, state = noisy()
-    _, convergence = Optimizer(system, Effort(tolerance=1e-4)).run(state, BATCH.gate, 40)
+    _, convergence = Optimizer(system).run(state, Stage(BATCH.gate, 40, 1e-4))
     assert 1 <= len(searched) < convergence.rounds
 
 
@@ -111,14 +118,14 @@ def test_a_tolerance_ends_it_sooner() -> None:
     rounds = []
     for tolerance in (1e-4, 100.0):
         system, state = noisy()
-        _, convergence = Optimizer(system, Effort(tolerance=tolerance)).run(state, BATCH.gate, 40)
+        _, convergence = Optimizer(system).run(state, Stage(BATCH.gate, 40, tolerance))
         rounds.append(convergence.rounds)
     assert rounds[1] < rounds[0]
 
 
 def test_without_rounds_left_it_has_not_converged() -> None:
     system, state = noisy()
-    _, convergence = Optimizer(system).run(state, gate=8.0, rounds=2)
+    _, convergence = Optimizer(system).run(state, Stage(8.0, 2))
     assert not convergence.converged
     assert convergence.rounds == 2
     assert convergence.reason == "no round left"
@@ -130,7 +137,7 @@ def test_the_cost_never_grows_in_a_step() -> None:
     start = Optimizer(system).align_poses(state, BATCH.gate)
     costs = []
     for rounds in (1, 2, 4, 8):
-        at, _ = Optimizer(system).run(start, BATCH.gate, rounds)
+        at, _ = Optimizer(system).run(start, Stage(BATCH.gate, rounds))
         costs.append(at.cost)
     assert (np.diff(costs) < 1e-3).all()
 
@@ -139,8 +146,8 @@ def test_a_damping_that_is_too_large_leaves_the_map_beside_its_poses() -> None:
     """The poses are free, as they aren't damped, and the map goes with them."""
     system, state = noisy()
     optimizer = Optimizer(system)
-    optimizer.damping = Damping(first=1e12, least=1e12, most=1e13)
-    at, _ = optimizer.run(state, BATCH.gate, 1)
+    optimizer.damping = Damping(first=1e9, least=1e9, most=1e13)
+    at, _ = optimizer.run(state, Stage(BATCH.gate, 1))
     assert np.abs(at.state.poses - state.poses).max() > 1e-3
     for label, gauge in system.gauges.items():
         carried = gauge.carried(state.control_points(label), state.poses, at.state.poses)
@@ -151,7 +158,7 @@ def test_where_no_damping_is_allowed_nothing_moves() -> None:
     system, state = noisy()
     refused = Optimizer(system)
     refused.damping = Damping(first=1.0, most=0.1)
-    at, _ = refused.run(state, BATCH.gate, 1)
+    at, _ = refused.run(state, Stage(BATCH.gate, 1))
     np.testing.assert_array_equal(at.state.variables.values, state.variables.values)
 
 

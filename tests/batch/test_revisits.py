@@ -114,7 +114,7 @@ def test_the_true_drive_is_about_a_sigma_away() -> None:
 def test_an_optimum_that_bends_the_drive_is_refused(sigmas: float, why: str) -> None:
     """Each pose is off by so many standard deviations in each direction."""
     chain, truth = course()
-    system: Any = SimpleNamespace(chain=chain, revisits=(revisit(truth),))
+    system: Any = SimpleNamespace(chains=[chain], revisits=(revisit(truth),))
     known = aligned_odometry(chain, system.revisits)
     off = BENT_SIGMAS * sigmas
     poses = known.poses + off * np.linalg.cholesky(known.covariances).sum(axis=2)
@@ -131,6 +131,6 @@ def test_a_bias_that_the_optimum_has_found_is_no_disagreement() -> None:
     chain, truth = course()
     calibration = chain.calibration_mean + chain.calibration_sigma * np.array([0.0, 100.0])
     measured = replace(drawn_chain(chain, calibration, np.random.default_rng(2)), bias=None)
-    system: Any = SimpleNamespace(chain=measured, revisits=(revisit(truth),))
+    system: Any = SimpleNamespace(chains=[measured], revisits=(revisit(truth),))
     assert disagreement(system, truth, chain.calibration_mean) != ""
     assert disagreement(system, truth, calibration) == ""

@@ -10,7 +10,6 @@ from pathspace_graph.batch.simplification import (
     Scatter,
     cross_validated,
     fit_line,
-    new_from_old,
     reknot,
     simplified,
 )
@@ -19,7 +18,6 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import sampled
-from pathspace_graph.spline.knots import fit_spline
 
 from ..scenes.batch import settled, straight
 
@@ -31,7 +29,7 @@ SETTINGS = MapperSettings()
 def dense_scene() -> tuple[State, DetectionTable, MapperSettings]:
     """Returns a straight drive beside curves with about one control point for each cone."""
     system, state = straight()
-    state = reknot(state, system.detections, system.settings, dense=True)
+    state = reknot(state, system.detections, system.settings)
     system.begin(state)
     return settled(system, state), system.detections, system.settings
 
@@ -88,13 +86,16 @@ def test_a_map_that_is_uncertain_as_a_whole_stays_so() -> None:
         )
 
 
-def test_a_curve_on_its_own_knots_is_itself() -> None:
-    state, _, _ = dense_scene()
-    for label, boundary in state.boundaries.items():
-        points = state.control_points(label)
-        np.testing.assert_allclose(
-            new_from_old(boundary, points, boundary, points), np.eye(boundary.size), atol=1e-6
-        )
+def test_the_new_control_points_are_linear_in_the_old_ones() -> None:
+    """`C_new = F C_old`, and the new curve moves with the old one where that is pushed aside."""
+    state, detections, settings = dense_scene()
+    simple = simplified(state, detections, settings)
+    few, change = simple.state, simple.change
+    np.testing.assert_allclose(change @ state.map_points.ravel(), few.map_points.ravel(), atol=1e-6)
+    bump = np.zeros_like(state.map_points)
+    bump[:, 1] = np.sin(state.map_points[:, 0] / 8.0)
+    moved = (change @ bump.ravel()).reshape(-1, 2)[:, 1]
+    np.testing.assert_allclose(moved, np.sin(few.map_points[:, 0] / 8.0), atol=0.15)
 
 
 def test_scatter_grows_from_seen_to_unseen() -> None:
@@ -130,8 +131,9 @@ def test_the_places_of_a_line_are_as_far_apart_as_its_length_allows() -> None:
 def test_a_line_has_as_few_control_points_as_its_shape_needs() -> None:
     """A circle of 20 m radius on 60 control points needs far fewer within 0.05 m."""
     phi = 2.0 * np.pi * np.arange(120) / 120.0
-    circle = fit_spline(20.0 * np.column_stack([np.cos(phi), np.sin(phi)]), 60, True)
-    few = fit_line(circle, SETTINGS)
+    circle = 20.0 * np.column_stack([np.cos(phi), np.sin(phi)])
+    few, u = fit_line(circle, True, SETTINGS.spline)
     assert 8 <= few.size <= 16
+    np.testing.assert_allclose(few.evaluate(u), circle, atol=0.1)
     radii = np.hypot(*sampled(few, 0.5).T)
     assert np.sqrt(np.mean((radii - 20.0) ** 2)) < 0.05

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.association import laps_of, match_stations
+from pathspace_graph.batch.association import laps_of_detections, match_stations
 from pathspace_graph.batch.gtsam_graph import nonlinear_graph
 from pathspace_graph.batch.lap import OpenLap, along_of, lap_optimum, marginal_of, stations_on
 from pathspace_graph.batch.mapper import BatchMapper
@@ -59,13 +59,15 @@ def test_detections_of_both_passes_are_of_one_cone(off: float) -> None:
     system, at, _ = optimum()
     state, detections = at.state.copy(), system.detections
     for label in state.boundaries:
-        second = laps_of(at.state, detections, label) > 0
+        second = laps_of_detections(at.state, detections, label) > 0
         u = detections.u.copy()
         u[second & (detections.boundary == label)] += off
         detections = replace(detections, u=u)
     found = match_stations(state, detections, system.settings)
     assert found is not None
-    again = np.concatenate([laps_of(state, detections, label)[found.rows] > 0 for label in state.boundaries])
+    again = np.concatenate(
+        [laps_of_detections(state, detections, label)[found.rows] > 0 for label in state.boundaries]
+    )
     assert again.any()
     cone = true_cones(system, found.rows)
     for station in np.unique(found.station):

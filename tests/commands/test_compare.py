@@ -114,23 +114,6 @@ def test_without_truth_the_command_says_so_and_draws_the_maps(
     assert (out / "maps.png").exists()
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (["--estimators", "nothing"], "'nothing'"),
-        (["--jobs", "0"], "jobs"),
-        (["--lag", "nan"], "lag"),
-    ],
-)
-def test_bad_usage_is_one_line_and_leaves_nothing(
-    options: list[str], expected: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["compare", str(folder / "a"), "--out", str(tmp_path / "out"), *options]) == 2
-    error = capsys.readouterr().err
-    assert expected in error and error.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "empty").mkdir()
     assert main(["compare", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 2

@@ -144,8 +144,8 @@ def test_options_on_the_command_line_stand_over_the_file(tmp_path: Path) -> None
 BAD_FILES = {
     "unknown name": ("gate.chii = 3\n", "'gate.chii', the nearest is 'gate.chi'"),
     "name of a group": ("gate = 3\n", "'gate'"),
-    "wrong type": ('lag = "long"\n', "lag: expected a number, found 'long'"),
-    "wrong word": ('spline.knots = "none"\n', "spline.knots: expected"),
+    "wrong type": ('lag = "long"\n', "lag: expected a positive number, found 'long'"),
+    "wrong word": ('batch.start = "none"\n', "batch.start: expected"),
     "out of range": ("gate.chi = -1\n", "gate.chi: expected a positive number, found -1"),
     "no TOML": ("lag 3\n", "row 1"),
 }

@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 
 from pathspace_graph.cli import main
+from pathspace_graph.errors import PathspaceError
 from pathspace_graph.io.map import map_to_json
 
+from ..fuzz.targets import INPUTS, READ, TARGETS
 from ..scenes.maps import point_map
 
 USAGES = """
@@ -38,7 +40,7 @@ online LOG --out MAP --noise x | Choose from: "measured", "stated"
 online LOG --out MAP --plot map.doc | map.doc: expected a file name that ends
 online LOG --out MAP --settings --lag 3 | --settings requires an argument
 online LOG --out MAP --settings none.toml | none.toml: expected a file of settings, found none
-online LOG --out MAP --spline.degree 0 | spline.degree: expected a positive number
+online LOG --out MAP --spline.degree 0 | spline.degree: expected a positive whole number
 online LOG --out MAP --gauge.sigma-spacing inf | gauge.sigma_spacing: expected a positive number
 online LOG --out MAP --gate.huber nan | gate.huber: expected a positive number or inf
 online LOG --out MAP --start 0 0 0 | --start: expected --on MAP as well, found none
@@ -76,10 +78,11 @@ simulate LOG --generate 1 --out X | ['LOG']
 simulate --generate 99999999999999999999 --out LOG | --generate: unable to convert
 simulate --generate 1 --sensor lidar --out LOG | sensor
 simulate --generate -1 --out LOG | seed of a generated track: expected at least 0
-simulate --generate 1 --laps 0 --out LOG | laps: expected a positive number
+simulate --generate 1 --laps 0 --out LOG | laps: expected a positive whole number
 simulate --generate 1 --out LOG --sensor.fov nan | sensor.fov: expected a positive number
 simulate --event skidpad --out LOG --faults.sensor.colourless 2 | colourless: expected a number in [0, 1]
 simulate --track none.yaml --out LOG | none.yaml: expected a track file, found none
+compare map --out D --estimators nothing | 'nothing'
 ablate lagg --out D | the nearest is 'lag'
 ablate none.toml --out D | none.toml
 ablate lag --out D --tracks | --tracks requires at least 1 element
@@ -107,3 +110,42 @@ def test_a_wrong_usage_is_one_line(
     assert printed.err.count("\n") == 1 and printed.err.startswith("pathspace-graph: ")
     assert said in printed.err
     assert [path.name for path in tmp_path.iterdir()] == ["map"]
+
+
+# --- strange files, with which fuzzing began or which it found -------------------------------------------
+
+
+COMMANDS = {
+    "log": ["online", "{folder}", "--out", "{out}"],
+    "map": ["plot", "{folder}", "--out", "{out}.png"],
+    "track": ["simulate", "--track", "{track}", "--out", "{out}"],
+    "study": ["ablate", "{folder}/study.toml", "--out", "{out}"],
+}
+STRANGE = [file for file in INPUTS if file.name not in READ]
+
+
+@pytest.mark.parametrize("file", [file for file in INPUTS if file.name in READ], ids=lambda file: file.name)
+def test_a_good_file_of_the_corpus_is_read(file: Path, tmp_path: Path) -> None:
+    TARGETS[file.parent.name].run(file.read_bytes(), tmp_path)
+
+
+@pytest.mark.parametrize("file", STRANGE, ids=lambda file: f"{file.parent.name}-{file.name}")
+def test_a_strange_file_ends_in_one_line(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    if file.parent.name not in COMMANDS:
+        with pytest.raises(PathspaceError):
+            TARGETS[file.parent.name].run(file.read_bytes(), folder)
+        return
+    TARGETS[file.parent.name].write(file.read_bytes(), folder)
+    track = next(iter(folder.glob("track.*")), folder)
+    command = [
+        word.format(folder=folder, track=track, out=tmp_path / "out") for word in COMMANDS[file.parent.name]
+    ]
+    assert main(command) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1 and "expected" in line and str(folder) in line
+    assert len(line) < 600
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]

@@ -93,6 +93,7 @@ def test_a_file_of_another_kind_is_named(
     content: bytes, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "drives").mkdir()
+    assert "expected a bag, found none" in refused(tmp_path / "drives" / "drive.bag", capsys)
     assert described(tmp_path / "drives") == "an empty folder"
     for name in ("drive.bag", "drive.mcap", "drive.db3", "drive"):
         file = tmp_path / "drives" / name

@@ -13,8 +13,8 @@ import pytest
 from scipy.spatial import KDTree
 
 from pathspace_graph.cli import main
-from pathspace_graph.convert.lines import ReckonedPath, along_lines, lines_of, resampled, spaced_apart
 from pathspace_graph.convert.messages import ALONE, DENSE, Points, points_of
+from pathspace_graph.convert.recording import ReckonedPath, along_lines, lines_of, resampled, spaced_apart
 from pathspace_graph.convert.settings import Frames, LabelRule
 from pathspace_graph.estimators import make_online
 from pathspace_graph.io.log import Log, Odometry
@@ -25,8 +25,8 @@ from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import sampled
 
-from ..scenes.corridor import BEAMS, MOUNTING, RANGE_MAX, Corridor, corridor, write_json_lines
-from .bags import Messages, Written, write_bag
+from ..scenes.corridor import MOUNTING, RANGE_MAX, Corridor, corridor, write_json_lines
+from .bags import Messages
 
 RULE = LabelRule()
 AHEAD = Odometry(np.arange(0.0, 10.01, 0.1), np.tile([1.0, 0.0, 0.0], (101, 1)))
@@ -240,7 +240,7 @@ def test_the_walls_of_a_corridor_have_their_sides(scene: Corridor, tmp_path: Pat
 
 @pytest.mark.slow
 def test_the_corridor_is_mapped(tmp_path: Path) -> None:
-    """A lap of 60 m closes, and both walls are mapped within a decimetre."""
+    """A lap of 60 m closes, and both walls are mapped within a decimetre, their kinks within two."""
     scene = corridor(laps=2)
     log = converted(write_json_lines(scene, tmp_path / "car.jsonl"), tmp_path / "log", "--from", "jsonl")
     settings = MapperSettings()
@@ -248,27 +248,9 @@ def test_the_corridor_is_mapped(tmp_path: Path) -> None:
     assert result.map.closed
     for name, wall in (("left", scene.left), ("right", scene.right)):
         curve = sampled(result.map.boundaries[name].spline, 0.02)
-        assert KDTree(curve).query(wall)[0].max() < 0.15
+        distance = KDTree(curve).query(wall)[0]
+        assert np.sqrt(np.mean(distance**2)) < 0.08 and distance.max() < 0.2
         assert result.map.boundaries[name].size <= 40
-
-
-def test_a_bag_of_scans_is_the_same_log(scene: Corridor, tmp_path: Path) -> None:
-    file = write_json_lines(scene, tmp_path / "car.jsonl")
-    expected = converted(file, tmp_path / "log", "--from", "jsonl", "--end", "3")
-
-    def make(messages: Messages) -> list[Written]:
-        twists = zip(scene.odometry.t.tolist(), scene.odometry.twist, strict=True)
-        written: list[Written] = [(t, "/odom", messages.odometry(t, twist)) for t, twist in twists if t < 4.0]
-        step = float(BEAMS[1] - BEAMS[0])
-        scans = zip(scene.scan_t.tolist(), scene.ranges, strict=True)
-        written += [(t, "/scan", scan(messages, t, r, float(BEAMS[0]), step)) for t, r in scans if t < 4.0]
-        return sorted(written, key=lambda one: one[0])
-
-    bag = write_bag(tmp_path, "mcap", make)
-    log = converted(bag, tmp_path / "other", "--odometry", "/odom", "--detections", "/scan", "--end", "3")
-    assert log.sensor == expected.sensor
-    first, same = log.cycles[10], expected.cycles[10]
-    np.testing.assert_allclose(first.points_vehicle, same.points_vehicle, atol=2e-3)
 
 
 def test_json_lines_hold_polylines(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from pathspace_graph.convert.recording import (
     twists_between,
     windowed,
 )
-from pathspace_graph.convert.settings import Frames, NoiseSettings, Window
+from pathspace_graph.convert.settings import Frames, NoiseSettings, Side, Window
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.se2 import compose, se2_exp
 from pathspace_graph.io.log import ray_covariances
@@ -34,23 +34,13 @@ def one(x: float, y: float, covariance: object = np.nan) -> Points:
     return Points.of([[x, y]], [0], np.broadcast_to(covariance, (1, 2, 2)))
 
 
-def test_points_and_covariances_go_to_the_vehicle_frame() -> None:
-    """The sensor is turned to the left by 0.3 rad: its long axis, which leads to the cone, turns with it."""
+@pytest.mark.parametrize(("y", "side"), [("left", 1.0), ("right", -1.0)])
+def test_points_and_covariances_go_to_the_vehicle_frame(y: Side, side: float) -> None:
+    """The sensor is turned by 0.3 rad, once y points to the left: its long axis, along the ray, with it."""
     c, s, ray = np.cos(0.3), np.sin(0.3), np.array([0.8, 0.6])
-    turned = np.array([0.8 * c - 0.6 * s, 0.8 * s + 0.6 * c])
+    turned = np.array([0.8 * c - side * 0.6 * s, 0.8 * s + side * 0.6 * c])
     covariance = 4.0 * np.outer(ray, ray) + 0.01 * np.eye(2)
-    log = to_log(record(one(4.0, 3.0, covariance)), Frames((1.0, 0.5, 0.3)), NoiseSettings(), FILE)
-    np.testing.assert_allclose(log.cycles[0].points_vehicle, [[1.0, 0.5] + 5.0 * turned], atol=1e-12)
-    expected = 4.0 * np.outer(turned, turned) + 0.01 * np.eye(2)
-    np.testing.assert_allclose(log.cycles[0].covariances[0], expected, atol=1e-12)
-
-
-def test_the_sensor_is_flipped_before_it_is_mounted() -> None:
-    """What is at (4, 3) with y to the right is at (4, -3) before the sensor's turn by 0.3 rad."""
-    c, s, ray = np.cos(0.3), np.sin(0.3), np.array([0.8, 0.6])
-    turned = np.array([0.8 * c + 0.6 * s, 0.8 * s - 0.6 * c])
-    covariance = 4.0 * np.outer(ray, ray) + 0.01 * np.eye(2)
-    frames = Frames((1.0, 0.5, 0.3), y="right", y_odometry="left")
+    frames = Frames((1.0, 0.5, 0.3), y=y, y_odometry="left")
     log = to_log(record(one(4.0, 3.0, covariance)), frames, NoiseSettings(), FILE)
     np.testing.assert_allclose(log.cycles[0].points_vehicle, [[1.0, 0.5] + 5.0 * turned], atol=1e-12)
     expected = 4.0 * np.outer(turned, turned) + 0.01 * np.eye(2)

@@ -181,22 +181,6 @@ def test_a_pause_is_not_a_stray_stamp() -> None:
     assert not strays(np.array([0.0, 1.0, 31.0, 2.0, 3.0])).any()  # 29 s, as long as a silence may be
 
 
-@pytest.mark.parametrize("mode", ["yaw", "jump"])
-@pytest.mark.skipif(not CASES.is_dir(), reason="the cases of others aren't beside the repository")
-def test_the_case_of_others_is_named_and_mapped(
-    mode: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """As `make.py` of yaw_wrap_and_jumps makes it."""
-    rows = table(drive())
-    if mode == "jump":
-        rows[500, 1] += 1.9 / (rows[501, 0] - rows[500, 0])
-    else:
-        rows[:, 3] = np.gradient(wrapped(true_poses(drive(), rows[:, 0])[:, 2]), rows[:, 0])
-    out = convert(write(tmp_path, drive(), rows))
-    assert "odometry samples can't be" in capsys.readouterr().out
-    assert main(["online", str(out), "--out", str(tmp_path / "map"), "--force"]) == 0
-
-
 # --- poses -----------------------------------------------------------------------------------------------
 
 
@@ -362,28 +346,6 @@ def test_the_noise_of_interpolated_twists_is_that_of_the_samples() -> None:
     np.testing.assert_allclose(found.odometry, 2.0 * held.odometry, rtol=0.3)
     stated = with_measured_noise(replace(fine, odometry_stated=True), 4)
     np.testing.assert_allclose(stated.odometry_sigma, 2.0 * log.odometry_sigma)
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_interpolated_twists_move_the_vehicle_better_than_held_ones(seed: int, tmp_path: Path) -> None:
-    """From second to second, relative to all twists; over a lap the errors of either cancel by chance."""
-    log, errors = drive(seed), list[np.ndarray]()
-    source = write(tmp_path, log, table(log, 10))
-    begin, end = log.odometry.t[0], log.odometry.t[-11]
-    at = np.arange(begin, end, 1.0)
-    expected = driven(log.odometry, at)
-    for options in ((), ("--held",)):
-        odometry = read_log(convert(source, *options)).odometry
-        errors.append(driven(odometry, at - begin + odometry.t[0]) - expected)
-    interpolated, held = (np.sqrt(np.square(one).mean(axis=0)) for one in errors)
-    assert interpolated[0] < 0.7 * held[0]  # that of vy is noise, whichever way
-    assert interpolated[2] < 0.5 * held[2]
-
-
-def driven(odometry: Odometry, t: np.ndarray) -> np.ndarray:
-    """Integrals (k - 1, 3) of the twists from each of some times (k,) to the next."""
-    sums = np.vstack([np.zeros(3), np.cumsum(np.diff(odometry.t)[:, None] * odometry.twist[:-1], axis=0)])
-    return np.diff(np.column_stack([np.interp(t, odometry.t, column) for column in sums.T]), axis=0)
 
 
 @pytest.mark.parametrize("seed", [0, 1])

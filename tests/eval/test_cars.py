@@ -15,12 +15,16 @@ from pathspace_graph.eval.cars import (
     joint_table,
     known_table,
     metrics_of_group,
+    odds_of_track,
+    odds_table,
     surveyed,
 )
 from pathspace_graph.eval.metrics.alignment import motion_onto
+from pathspace_graph.eval.metrics.measures import UNKNOWN
 from pathspace_graph.eval.metrics.reference import truth_of
 from pathspace_graph.factors.se2 import compose, move_points
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.places.find import SURE_ODDS
 from pathspace_graph.sim.track import to_map_frame
 
 from ..batch.joint.several import alone, lap
@@ -118,3 +122,26 @@ def test_there_is_a_row_for_each_map(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = joint_of_track("plain", 4, 4)
     assert [row["drives"] for row in rows] == [1, 1, 1, 1, 2, 2, 4]
     assert [row["logs"] for row in rows[4:]] == [["0", "1"], ["2", "3"], ["0", "1", "2", "3"]]
+
+
+def test_claims_are_counted_beside_those_that_their_odds_expect() -> None:
+    odds = [np.nan, np.nan, 1.0, 1.0, 20.0]
+    kinds, wrong = [OWN, OTHER, OWN, OWN, OTHER], [True, True, True, False, True]
+    table = odds_table(pd.DataFrame({"odds": odds, "kind": kinds, "wrong": wrong}))
+    rows = {
+        name: figures for name, *figures in table.frame.to_numpy().tolist() if set(figures) - {"0", "0.0"}
+    }
+    assert rows == {
+        "no place": ["1", "1", UNKNOWN, UNKNOWN],
+        "0 to 2": ["2", "0", "1", "0.5"],  # two at e to 1: 0.27 each
+        "15 to 100": ["0", "1", "1", "0.0"],
+    }
+
+
+def test_a_place_on_the_map_of_another_drive_is_held_against_the_truth() -> None:
+    rows = pd.DataFrame(odds_of_track("plain", 60))
+    own = rows[rows["kind"] == OWN]
+    assert len(own) == len(rows) / 2 > 20
+    assert not own["wrong"][own["odds"] > SURE_ODDS].any()
+    assert (own["odds"] > SURE_ODDS).mean() > 0.5
+    assert not (rows["odds"][rows["kind"] == OTHER] > SURE_ODDS).any()

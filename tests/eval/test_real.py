@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pathspace_graph.cli import main
-from pathspace_graph.eval.real import map_real_logs, maps_table, measured_table, runs_table
+from pathspace_graph.eval.cars import real_tables
 from pathspace_graph.io.log import Log
 from pathspace_graph.sim.simulate import preset, simulate
 from pathspace_graph.sim.track_generator import generate_track
@@ -30,20 +30,20 @@ def test_real_logs_are_mapped_and_held_against_each_other(tmp_path: Path) -> Non
         recorded = write_recorded(standing_drive(), tmp_path / "recorded" / name)
         assert main(["-q", "convert", str(recorded), *CONVERT, "--out", str(tmp_path / name)]) == 0
     logs, cells = [tmp_path / name for name in ("first", "second")], list[int]()
-    map_real_logs(logs, tmp_path / "out")
-    drives = map_real_logs(logs, tmp_path / "out", on_cell=lambda _, remaining: cells.append(remaining))
+    real_tables(logs, tmp_path / "out")
+    tables = real_tables(logs, tmp_path / "out", on_cell=lambda _, remaining: cells.append(remaining))
     assert cells == [0], "what was mapped is kept"
-    online = runs_table(drives).records()[0]
-    assert online["log, run"] == "first, online"
-    assert online["closed [%]"] == "100" and online["lost [%]"] == "0.0"
+    online = tables["runs"].records()[0]
+    assert online["track, estimator"] == "first, fixed-lag"
+    assert online["closed [%]"] == "100"
     assert float(online["end off by [m]"]) < 1.0
-    assert maps_table(drives).records()[0] | {"landmarks [m]": ""} == {
+    assert tables["maps"].records()[0] | {"landmark-fixed-lag [m]": ""} == {
         "maps": "first, second",
-        "online [m]": "0.00",
-        "batch [m]": "0.00",
-        "landmarks [m]": "",
+        "fixed-lag [m]": "0.00",
+        "spline [m]": "0.00",
+        "landmark-fixed-lag [m]": "",
     }
-    first, second, both = measured_table(drives).records()
+    first, second, both = tables["measured"].records()
     assert [row["log"] for row in (first, second, both)] == ["first", "second", "all drives"]
     assert both["scale [%]"].partition(" ")[0] == first["scale [%]"].partition(" ")[0]
 

@@ -13,9 +13,9 @@ import pytest
 from pathspace_graph.cli import main
 from pathspace_graph.eval import report
 from pathspace_graph.eval.experiment.faults import at_strength, fault_table, outcomes, suite
-from pathspace_graph.eval.experiment.statistics import estimate
 from pathspace_graph.eval.experiment.study import Study
-from pathspace_graph.eval.experiment.tables import Table, by_name, contrast_table
+from pathspace_graph.eval.experiment.tables import Table, by_name, contrast_table, last_laps
+from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.eval.report import (
     estimators_table,
     laps_table,
@@ -36,6 +36,7 @@ def frame(estimator: str, laps: int, rmse: float) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
+RMSE = METRICS["rmse"]
 STUDY = Study(tracks=(0,), laps=3, estimators=("fixed-lag", "spline"))
 BOTH = pd.concat([frame("fixed-lag", 3, 0.6), frame("spline", 3, 0.3)], ignore_index=True)
 
@@ -49,18 +50,8 @@ def labels(table: Table) -> list[object]:
     return [*table.frame.iloc[:, 0]]
 
 
-def test_a_figure_is_a_mean_with_its_interval_of_the_known_values() -> None:
-    """Of 1, 2, 3 the sample's deviation is 1, and Student's t of 2 degrees is 4.303."""
-    found = estimate(np.array([1.0, np.nan, 2.0, 3.0]))
-    assert (found.mean, found.count) == (pytest.approx(2.0), 3)
-    assert found.half == pytest.approx(4.302653 / np.sqrt(3.0), rel=1e-6)
-    assert found.text(1, 100.0) == "200.0 ± 248.4"
-    assert estimate(np.array([2.0])).text() == "2.000"
-    assert estimate(np.array([np.nan])).text() == "–"
-
-
 def test_the_table_of_laps_has_the_online_map_and_the_batch() -> None:
-    found = laps_table(STUDY, BOTH, (1, 2, 3, 10), ("rmse", "missed"))
+    found = laps_table(STUDY, BOTH, (1, 2, 3, 10), (RMSE, METRICS["missed"]))
     assert tuple(found.frame) == ("metric", "lap 1", "lap 2", "lap 3", "batch")
     assert labels(found) == ["rmse [m]", "missed [%]"]
     assert values(found, 0) == pytest.approx([0.6, 0.3, 0.2, 0.1])
@@ -77,7 +68,7 @@ def test_the_tables_of_accuracy_have_tracks_laps_and_metrics() -> None:
     found = rmse_table(STUDY, two)
     assert tuple(found.frame) == ("rmse after lap [m]", "fixed-lag", "spline")
     assert [values(found, lap)[0] for lap in range(3)] == pytest.approx([0.9, 0.45, 0.3])
-    found = estimators_table(STUDY, two, ("rmse", "missed_2m"))
+    found = estimators_table(STUDY, two, (RMSE, METRICS["missed_2m"]))
     assert tuple(found.frame) == ("metric", "fixed-lag", "spline")
     assert values(found, 0) == pytest.approx([0.3, 0.15])
     assert values(found, 1) == [None, None]
@@ -99,13 +90,13 @@ def test_a_study_s_table_has_paired_differences_from_its_baseline() -> None:
 
 def test_the_skidpad_s_trajectory_error_is_over_all_rounds() -> None:
     """Of 1 m and 2 m the rms is that of 2.5 m^2."""
-    found = skidpad_table(STUDY, frame("fixed-lag", 2, 0.6), ("ate", "rmse"))
+    found = skidpad_table(STUDY, frame("fixed-lag", 2, 0.6), (METRICS["ate"], RMSE))
     assert values(found, 0)[0] == pytest.approx(np.sqrt(2.5), abs=5e-4)
 
 
 def test_a_table_of_runs_has_a_row_for_each_noise_and_estimator() -> None:
     noises = pd.concat([BOTH.assign(noise=noise) for noise in ("1 m", "4 m")], ignore_index=True)
-    found = by_name(noises, ("noise", "estimator"), ("rmse", "nees"))
+    found = by_name(last_laps(noises), ("noise", "estimator"), (RMSE, METRICS["nees"]))
     assert tuple(found.frame) == ("noise, estimator", "rmse [m]", "NEES per degree of freedom")
     assert labels(found) == ["1 m, fixed-lag", "1 m, spline", "4 m, fixed-lag", "4 m, spline"]
     assert values(found, 3) == [pytest.approx(0.1), None]

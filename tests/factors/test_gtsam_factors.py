@@ -14,7 +14,6 @@ from pathspace_graph.factors.gtsam_factors import (
     calibrated_odometry_factor,
     pose_array,
     smoothness_factors,
-    spacing_factors,
     spline_projection_factors,
 )
 from pathspace_graph.factors.linear import linear_factor
@@ -197,8 +196,6 @@ def test_what_does_not_fit_is_refused() -> None:
         )
     with pytest.raises(ValueError, match="expected as many"):
         straight_factor(np.zeros(2), np.zeros((1, 2)))
-    with pytest.raises(ValueError, match="expected 2 distances"):
-        spacing_factors([1, 2, 3], np.ones(3), np.ones(3), False)
     with pytest.raises(ValueError, match="expected a key for each of 4 columns"):
         smoothness_factors([1, 2, 3], smoothness_matrix(np.arange(4.0), None), 1.0)
 
@@ -215,11 +212,6 @@ def test_smoothness_factors_are_the_matrix_far_from_zero(period: float | None) -
     assert all(len(f.keys()) <= 3 for f in factors)
     expected = 0.5 * np.sum((matrix @ points / 0.5) ** 2)
     assert sum(f.error(values) for f in factors) == pytest.approx(expected, rel=1e-12)
-
-
-def test_periodic_spacing_closes_the_ring() -> None:
-    factors = spacing_factors([5, 6, 7], np.full(3, 2.0), np.ones(3), True)
-    assert [f.keys() for f in factors] == [[5, 6], [6, 7], [7, 5]]
 
 
 def test_a_linear_factor_over_many_keys() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.front_end.cone_rows import DEALT_OUT, ConeRow, deal_out, extend_rows
+from pathspace_graph.front_end.cone_rows import ROW_GAP, ConeRow, extend_rows
 from pathspace_graph.mapping.path import crosses
 
 Array = NDArray[np.float64]
@@ -91,7 +91,7 @@ def test_a_hairpin_is_followed_around_its_inner_row() -> None:
 
 def begun(points: Array, half_width: float = 1.75) -> tuple[ConeRow, ConeRow]:
     """Two rows that begin beside a vehicle at the origin, which heads along x."""
-    left, right = np.array([[0.0, half_width]]), np.array([[0.0, -half_width]])
+    left, right = (np.array([[-8.0, side], [0.0, side]]) for side in (half_width, -half_width))
     ahead = np.array([1.0, 0.0])
     return ConeRow(1.0, left, ahead, points), ConeRow(-1.0, right, ahead, points)
 
@@ -106,10 +106,10 @@ def bend(radius: float, half_width: float, gap: float, angle: float) -> tuple[Ar
     return rows[0], rows[1]
 
 
-def dealt_out(left: Array, right: Array, half_width: float = 1.75) -> tuple[list[int], list[int]]:
+def extended(left: Array, right: Array, half_width: float = 1.75) -> tuple[list[int], list[int]]:
     points = np.concatenate([left, right])
     rows = begun(points, half_width)
-    deal_out(rows, np.arange(len(points)), np.ones((2, len(points)), bool))
+    extend_rows(*rows, np.array([[-8.0, 0.0], [0.0, 0.0]]), 0.7)
     return rows[0].chosen, rows[1].chosen
 
 
@@ -117,7 +117,7 @@ def dealt_out(left: Array, right: Array, half_width: float = 1.75) -> tuple[list
 @pytest.mark.parametrize("half_width", [1.5, 2.0, 3.0])
 def test_both_rows_of_a_bend_are_followed_to_their_ends(radius: float, half_width: float) -> None:
     left, right = bend(radius, half_width, 3.5, min(1.5, 15.0 / radius))
-    found = dealt_out(left, right, half_width)
+    found = extended(left, right, half_width)
     assert found == (list(range(len(left))), list(range(len(left), len(left) + len(right))))
 
 
@@ -125,22 +125,9 @@ def test_a_row_with_a_missing_cone_does_not_lead_across_the_track() -> None:
     """The next cone of the right row is 7 m ahead; the cone across is 4.4 m away, and is of the left row."""
     left = np.array([[4.0, 1.75], [8.0, 1.75], [12.0, 1.75]])
     right = np.array([[7.0, -1.75], [11.0, -1.75]])
-    assert dealt_out(left, right) == ([0, 1, 2], [3, 4])
-
-
-def test_a_cone_between_the_rows_ends_both() -> None:
-    left, right = np.array([[9.0, 1.75]]), np.array([[9.0, -1.75]])
-    middle = np.array([[5.0, 0.0]])
-    assert dealt_out(np.concatenate([left, middle]), right) == ([], [])
-
-
-def test_a_cone_that_may_not_be_of_the_row_that_it_fits_is_in_neither_row() -> None:
-    rows = begun(np.array([[4.0, 1.75], [4.0, -1.75]]))
-    deal_out(rows, np.arange(2), np.array([[False, True], [True, True]]))
-    assert rows[0].chosen == []
-    assert rows[1].chosen == [1]
+    assert extended(left, right) == ([0, 1, 2], [3, 4])
 
 
 def test_a_row_does_not_reach_farther_than_a_gap() -> None:
-    left = np.array([[DEALT_OUT.gap + 0.1, 1.75]])
-    assert dealt_out(left, np.zeros((0, 2))) == ([], [])
+    left = np.array([[ROW_GAP + 0.1, 1.75]])
+    assert extended(left, np.zeros((0, 2))) == ([], [])

@@ -27,32 +27,30 @@ def test_both_calibrations_are_one_view() -> None:
 
 
 def test_the_prior_counts_in_its_sigmas() -> None:
-    variables = Variables()
-    variables.insert_calibrations(np.concatenate([np.zeros(2), 2.0 * np.array(ESTIMATED.sigmas)]))
-    (rows,) = sensor_prior(variables, ESTIMATED)
+    rows = sensor_prior(2.0 * np.array(ESTIMATED.sigmas), ESTIMATED, 3)
     np.testing.assert_allclose(rows.residual, 2.0)
     np.testing.assert_allclose(np.diag(rows.jacobian) * ESTIMATED.sigmas, 1.0)
-    assert half_square(sensor_prior(variables, ESTIMATED)) == 0.5 * 5 * 4.0
+    np.testing.assert_array_equal(rows.keys, SENSOR_KEY + 3)
 
 
 def test_the_prior_counts_from_its_mean() -> None:
     known = CalibrationSettings(yaw=0.02, lateral=-0.3, latency=0.05, range_scale=-0.04, range_bias=0.1)
-    variables = Variables()
     off = np.array([1.0, -2.0, 3.0, 0.0, 1.0])
-    variables.insert_calibrations(
-        np.concatenate([np.zeros(2), [0.02, -0.3, 0.05, -0.04, 0.1] + off * known.sigmas])
-    )
-    (rows,) = sensor_prior(variables, known)
+    rows = sensor_prior(np.array([0.02, -0.3, 0.05, -0.04, 0.1] + off * known.sigmas), known)
     np.testing.assert_allclose(rows.residual, off, atol=1e-12)
-    assert half_square(sensor_prior(variables, known)) == pytest.approx(0.5 * 15.0)
+    assert half_square([rows]) == pytest.approx(0.5 * 15.0)
 
 
-def test_a_sensor_that_is_known_has_no_prior() -> None:
+@pytest.mark.parametrize(("settings", "keys"), [(KNOWN, 1), (ESTIMATED, 2)])
+def test_a_sensor_that_is_known_has_no_prior(settings: CalibrationSettings, keys: int) -> None:
+    still = integrate_odometry(Odometry(np.zeros(1), np.zeros((1, 3))), 0.1, np.ones(3))
+    chain = chained([0.1], [MeasuredMotion(still, np.zeros((1, 3)))], OdometrySettings())
     variables = Variables()
-    variables.insert_calibrations(np.zeros(2))
-    assert sensor_prior(variables, KNOWN) == []
-    assert half_square(sensor_prior(variables, KNOWN)) == 0.0
-    np.testing.assert_array_equal(variables.calibration_keys, [CALIBRATION_KEY])
+    variables.insert_calibrations(np.zeros(2 + 5 * settings.sensor))
+    variables.insert(pose_keys(np.arange(1)), np.zeros(3))
+    owned = {int(key) for rows in chain.rows_at(variables, settings) for key in rows.keys.ravel()}
+    assert owned == {*variables.calibration_keys.tolist(), int(pose_keys(np.arange(1))[0])}
+    assert len(variables.calibration_keys) == keys
 
 
 def test_the_first_pose_is_as_uncertain_as_the_start_and_the_odometry_since() -> None:

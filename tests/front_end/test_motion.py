@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.noise import TwistNoise
-from pathspace_graph.factors.se2 import relative
+from pathspace_graph.factors.se2 import compose, relative, rotation
 from pathspace_graph.front_end import scan_matching
-from pathspace_graph.front_end.motion import MotionCheck
+from pathspace_graph.front_end.motion import MotionCheck, is_possible
+from pathspace_graph.front_end.scan_matching import Match
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.run import split_odometry
@@ -154,6 +156,28 @@ def test_a_gap_without_detections_is_as_uncertain_as_it_is_long() -> None:
     assert spreads[-1] > 10 * spreads[5]
 
 
+def test_what_twists_lack_is_how_much_longer_they_are_held_than_usual() -> None:
+    """Measured every 0.1 s and held from 0.3 s on at a cost; the first row repeats one from 0.2 s before."""
+    stamps, twists = (
+        np.array([1.0, 1.05, 1.15, 1.7]),
+        np.array([[5.0, 0, 0], [5.0, 0, 0], [4.0, 0, 0], [3.0, 0, 1]]),
+    )
+    first, until, accelerations = 0.8, 2.3, (5.0, 4.0, 2.0)
+    durations, excess, interval, missing, same = kernels.held_twists(
+        stamps, twists, until, first, np.inf, (0.15, 3.0), accelerations
+    )
+    measured, ends = np.array([first, *stamps[1:]]), np.array([*stamps[1:], until])
+    assert interval == pytest.approx(np.diff(measured).min())
+    np.testing.assert_allclose(durations, np.diff(np.append(stamps, until)))
+    longer = np.maximum(ends - measured - 3.0 * np.diff(measured).min(), 0.0)
+    np.testing.assert_allclose(excess, longer[:, None] * accelerations)
+    assert (excess[:, 0] > 0.0).tolist() == [False, False, True, True]
+    assert missing and same == 1
+    none = kernels.held_twists(stamps[:3], twists[:3], 1.2, first, interval, (0.15, 3.0), accelerations)
+    np.testing.assert_array_equal(none[1], np.zeros(3))
+    assert not none[3]
+
+
 def test_readings_that_never_change_are_believed_if_the_detections_agree() -> None:
     """An exact drive at constant speed has the same twist in each row."""
     cones = np.array([[x, side] for x in np.arange(0.0, 60.0, 4.0) for side in (-2.0, 2.0)])
@@ -286,3 +310,17 @@ def test_an_odometry_that_was_contradicted_is_doubted_earlier_for_12_s(
 def _cycle(t: float, points: Array) -> Detections:
     covariances = np.tile(0.01 * np.eye(2), (len(points), 1, 1))
     return Detections(t, points, covariances, np.full(len(points), 2))
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.5 * np.pi, -2.0])
+def test_a_match_that_knows_nothing_along_the_road_still_cannot_jump_across_it(heading: float) -> None:
+    start, turn = np.array([20.0, -30.0, heading]), np.eye(3)
+    turn[:2, :2] = rotation(heading)
+    information = turn @ np.diag(np.array([1.0, 0.03, 0.003]) ** -2.0) @ turn.T
+
+    def jumps(way: list[float]) -> bool:
+        found = Match(compose(start, np.array(way)), information, np.ones(9, bool), 9, 1.0)
+        return is_possible(found, start, 0.1)
+
+    assert jumps([1.9, 0.0, 0.0])
+    assert not jumps([0.0, 1.9, 0.0])

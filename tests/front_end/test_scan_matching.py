@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,32 +12,39 @@ from hypothesis import strategies as st
 from pathspace_graph.factors.se2 import to_map, to_vehicle
 from pathspace_graph.front_end import scan_matching
 from pathspace_graph.front_end.scan_matching import (
-    LEARNED_ERRORS,
     MOST_MISFIT,
     REACH_LAST,
     REACHES,
     SCAN_MEMORY,
     SIGMA_CONE,
-    RecentDetections,
-    match,
-    misfit_at,
+    Match,
+    ScanMatcher,
+    Seen,
 )
+from pathspace_graph.settings.online import MotionSettings
 
+from ..scenes.drives import detections
 from ..scenes.jacobians import numeric_jacobian
 
 CONES = np.array([[2.0, 2.0], [6.0, 2.2], [10.0, 2.0], [2.5, -1.9], [7.0, -2.0], [11.0, -2.1]])
 
 
-def remember(recent: RecentDetections, t: float, points: np.ndarray) -> None:
-    """Adds detections from the origin, by a sensor without errors."""
-    recent.add(t, points, np.zeros((len(points), 2, len(LEARNED_ERRORS))), np.zeros(3))
+def remember(matcher: ScanMatcher, t: float, points: np.ndarray) -> None:
+    """Adds detections from the origin."""
+    matcher.remember(detections(t, points, np.zeros(len(points), np.intp)), np.zeros(3), np.zeros(3))
 
 
-def seen_once(cones: np.ndarray = CONES) -> RecentDetections:
+def seen_once(cones: np.ndarray = CONES) -> ScanMatcher:
     """The cones as they were detected once, without noise, from the origin."""
-    recent = RecentDetections()
-    remember(recent, 0.0, cones)
-    return recent
+    matcher = ScanMatcher(MotionSettings())
+    remember(matcher, 0.0, cones)
+    return matcher
+
+
+def match(matcher: ScanMatcher, points: np.ndarray, variances: np.ndarray, *start: Any) -> Match:
+    found = matcher.match(Seen(points, variances), *start)
+    assert found is not None
+    return found
 
 
 def detected(pose: np.ndarray, cones: np.ndarray = CONES) -> np.ndarray:
@@ -49,7 +58,6 @@ def test_exact_detections_give_the_exact_motion(x: float, y: float, theta: float
     found = match(seen_once(), detected(pose), np.full(6, 0.01), start, REACHES)
     np.testing.assert_allclose(found.pose, pose, atol=1e-3)
     assert found.matched == 6
-    assert found.is_certain
 
 
 # the information, where no coordinate, heading, weight or variance is a special one
@@ -79,7 +87,7 @@ def test_the_covariance_is_that_of_many_noisy_matches(monkeypatch: pytest.Monkey
     monkeypatch.setattr(scan_matching, "SCAN_HUBER", np.inf)
     seen, errors = detected(POSE, ASYMMETRIC), []
     for _ in range(400):
-        recent = RecentDetections()
+        recent = ScanMatcher(MotionSettings())
         for k in range(n):
             remember(recent, 0.1 * k, ASYMMETRIC + sigma * rng.standard_normal(ASYMMETRIC.shape))
         points = seen + sigma * rng.standard_normal(seen.shape)
@@ -97,7 +105,7 @@ def test_the_misfit_at_a_pose_is_the_mean_square_of_the_whitened_distances(n: in
     off = np.array([[0.0, 0.2], [0.0, 0.0], [0.0, 0.2], [0.0, 0.0]])
     weight = n * np.exp(-0.5 * (0.2 / REACH_LAST) ** 2)
     square = 0.2**2 / (0.04 * (1.0 + 1.0 / weight) + SIGMA_CONE**2)
-    found = misfit_at(recent, seen + off, variances, POSE)
+    found = recent.misfit(Seen(seen + off, variances), POSE)
     assert found == pytest.approx((square + 0.0 + 2.0 * MOST_MISFIT) / 4.0)
 
 
@@ -109,38 +117,39 @@ def test_a_detection_of_nothing_has_no_say() -> None:
 
 
 def test_one_cone_holds_no_motion() -> None:
-    found = match(seen_once(CONES[:1]), CONES[:1], np.full(1, 0.01), np.zeros(3), REACHES)
-    assert found.matched == 1
-    assert not found.is_certain
+    one, seen = seen_once(CONES[:1]), Seen(CONES[:1], np.full(1, 0.01))
+    assert one.has(seen, np.zeros(3)).all()
+    assert one.match(seen, np.zeros(3), REACHES) is None
 
 
 def test_detections_of_one_cone_alone_hold_no_motion_however_many_they_are() -> None:
     """All offsets have the same arm, so that the information is singular."""
     points = np.tile(CONES[:1], (5, 1))
-    found = match(seen_once(CONES[:1]), points, np.full(5, 0.01), np.zeros(3), REACHES)
-    assert found.matched == 5
-    assert np.isfinite(found.pose).all()
-    assert not found.is_certain
+    one, seen = seen_once(CONES[:1]), Seen(points, np.full(5, 0.01))
+    assert one.has(seen, np.zeros(3)).all()
+    assert one.match(seen, np.zeros(3), REACHES) is None
 
 
 def test_old_detections_are_forgotten() -> None:
     recent = seen_once()
     remember(recent, 0.1, CONES[:2])
-    recent.forget(SCAN_MEMORY + 0.01)
+    recent.corrected(detections(SCAN_MEMORY + 0.01, CONES, np.zeros(6, np.intp)), np.zeros(3))
     np.testing.assert_array_equal(recent.points, CONES[:2])
 
 
 def test_remembered_detections_follow_what_is_learned_of_the_sensor() -> None:
     """A detection at (4, 0) from (1, 2), which looks to the left, moves by its derivative, turned as well."""
-    recent = RecentDetections()
-    columns = np.array([[[0.0, -3.0], [4.0, 0.0]]])  # a turned sensor moves it to the left
-    recent.add(0.0, np.array([[4.0, 0.0]]), columns, np.array([1.0, 2.0, np.pi / 2]))
+    recent, one = ScanMatcher(MotionSettings()), detections(0.0, np.array([[4.0, 0.0]]), np.zeros(1, np.intp))
+    twist, pose = np.array([3.0, 0.0, 0.0]), np.array([1.0, 2.0, np.pi / 2])
+    recent.remember(one, twist, pose)
     np.testing.assert_allclose(recent.points, [[1.0, 6.0]], atol=1e-12)
-    np.testing.assert_allclose(recent.seen_from, [1.0, 2.0])
-    recent.correct(np.array([0.01, 0.1]))
+    recent.errors.mean = np.array([0.01, 0.1])
+    seen = recent.corrected(one, twist)
     np.testing.assert_allclose(recent.points, [[1.0 - 0.04, 6.0 - 0.3]], atol=1e-12)
+    np.testing.assert_allclose(to_map(seen.points, pose[None]), recent.points, atol=1e-12)
 
 
 def test_a_detection_is_seen_again_where_one_was() -> None:
-    seen = seen_once().has(np.array([[2.1, 2.0], [4.0, 0.0]]))
+    points = np.array([[2.1, 2.0], [4.0, 0.0]])
+    seen = seen_once().has(Seen(points, np.full(2, 0.01)), np.zeros(3))
     np.testing.assert_array_equal(seen, [True, False])

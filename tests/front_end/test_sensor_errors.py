@@ -17,11 +17,9 @@ from pathspace_graph.front_end.motion import MotionCheck
 from pathspace_graph.front_end.scan_matching import (
     LEARNED_ERRORS,
     SIGMAS_ERRORS,
-    Difference,
-    RecentDetections,
+    ScanMatcher,
+    Seen,
     SensorErrors,
-    by_errors,
-    match,
 )
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry
@@ -31,11 +29,16 @@ from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.sensor import OdometryNoise
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from ..scenes.drives import bean_track
+from ..scenes.drives import bean_track, detections
 
 Array = NDArray[np.float64]
 SETTINGS = MotionSettings()
 CONES = np.array([[4.0, 2.0], [8.0, 2.2], [12.0, 2.0], [4.5, -1.9], [9.0, -2.0], [13.0, -2.1]])
+
+
+def by_errors(points: Array, twist: Array) -> Array:
+    """Derivatives (m, 2, 2) of detections by yaw and latency."""
+    return by_sensor(points, twist[None])[:, :, LEARNED_ERRORS]
 
 
 def test_the_shifts_are_those_of_a_match_of_late_detections_of_a_turned_sensor() -> None:
@@ -47,9 +50,10 @@ def test_the_shifts_are_those_of_a_match_of_late_detections_of_a_turned_sensor()
     for pose, twist in ((begin, before), (end, now)):
         exact = to_vehicle(CONES, np.tile(pose, (len(CONES), 1)))
         seen.append(exact - by_errors(exact, twist) @ errors)
-    recent = RecentDetections()
-    recent.add(0.0, seen[0], by_errors(seen[0], before), begin)
-    found = match(recent, seen[1], np.full(6, 0.01), end, [0.4] * 6)
+    matcher, labels = ScanMatcher(SETTINGS), np.zeros(6, np.intp)
+    matcher.remember(detections(0.0, seen[0], labels), before, begin)
+    found = matcher.match(Seen(seen[1], np.full(6, 0.01)), end, [0.4] * 6)
+    assert found is not None
     known = SensorErrors(SETTINGS)
     known.follow(before, 10.0)
     off = relative(end, found.pose)
@@ -57,9 +61,9 @@ def test_the_shifts_are_those_of_a_match_of_late_detections_of_a_turned_sensor()
     np.testing.assert_allclose(known.shifts(way, now) @ errors, off, atol=2e-3)
     assert abs(off[0]) > 5e-3  # there is something to be seen
     assert abs(off[1]) > 5e-3
-    recent.correct(errors)
-    corrected = seen[1] + by_errors(seen[1], now) @ errors
-    found = match(recent, corrected, np.full(6, 0.01), end, [0.4] * 6)
+    matcher.errors.mean = errors
+    found = matcher.match(matcher.corrected(detections(0.1, seen[1], labels), now), end, [0.4] * 6)
+    assert found is not None
     np.testing.assert_allclose(found.pose, end, atol=5e-4)
 
 
@@ -68,7 +72,7 @@ def test_a_drive_at_one_speed_straight_ahead_says_nothing_of_the_latency() -> No
     known.follow(velocity, 10.0)
     before = known.covariance[1, 1]
     shifts = known.shifts(np.array([3.0, 0.0]), velocity)
-    known.update(Difference(np.array([0.1, -0.2, 0.0]), 0.01 * np.eye(3), shifts), 0.1)
+    known.update(np.array([0.1, -0.2, 0.0]), 0.01 * np.eye(3), shifts, 0.1)
     assert known.covariance[1, 1] == pytest.approx(before, rel=1e-3)
     assert known.mean[1] == pytest.approx(0.0)
     assert known.mean[0] > 0.0  # but a sensor that is turned to the left draws to the right
@@ -89,16 +93,16 @@ def test_matches_give_the_errors_with_the_claimed_covariance(
             noise = np.sqrt(np.diag(spread)) * rng.standard_normal(3)
             for _ in range(shared):
                 seen = shifts @ (truth - known.mean) + noise
-                known.update(Difference(seen, spread, shifts), scan_matching.SCAN_MEMORY / shared)
+                known.update(seen, spread, shifts, scan_matching.SCAN_MEMORY / shared)
         off.append(np.linalg.solve(np.linalg.cholesky(known.covariance), truth - known.mean))
     np.testing.assert_allclose(np.cov(np.array(off).T), np.eye(2), atol=0.25)
 
 
 def test_errors_may_change_as_much_in_a_minute_as_the_settings_say() -> None:
     """Matches that say nothing leave the covariance to grow."""
-    known, nothing = SensorErrors(SETTINGS), Difference(np.zeros(3), np.eye(3), np.zeros((3, 2)))
+    known = SensorErrors(SETTINGS)
     for _ in range(600):
-        known.update(nothing, 0.1)
+        known.update(np.zeros(3), np.eye(3), np.zeros((3, 2)), 0.1)
     expected = np.square(SIGMAS_ERRORS) + np.square(scan_matching.SIGMAS_CHANGES)
     np.testing.assert_allclose(known.covariance, np.diag(expected))
 
@@ -108,14 +112,8 @@ def test_an_old_latency_is_forgotten_so_that_a_new_one_is_learned() -> None:
     for cycle in range(9_000):
         truth = np.array([0.0, 0.0 if cycle < 7_500 else 0.03])
         shifts = known.shifts(np.array([1.0, 0.0]), np.array([*rng.normal(scale=0.5, size=2), 0.1]))
-        known.update(Difference(shifts @ (truth - known.mean), spread, shifts), scan_matching.SCAN_MEMORY)
+        known.update(shifts @ (truth - known.mean), spread, shifts, scan_matching.SCAN_MEMORY)
     assert known.mean[1] == pytest.approx(0.03, abs=0.003)
-
-
-def test_the_derivatives_are_those_of_the_calibration_of_the_sensor() -> None:
-    points, twist = CONES, np.array([8.0, 0.3, 0.7])
-    whole = by_sensor(points, np.tile(twist, (len(points), 1)))
-    np.testing.assert_allclose(by_errors(points, twist), whole[:, :, LEARNED_ERRORS])
 
 
 # --- whole drives ----------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pytest
 
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log
-from pathspace_graph.front_end.sides import FORGET_AFTER, NearCones, SideJudge
+from pathspace_graph.front_end.sides import SideJudge
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.run import split_odometry
@@ -165,29 +165,6 @@ def test_one_wrong_colour_among_ten_excludes_no_cone_from_its_row(
         found = judge.update(np.array([-2.0, 0.0, 0.0]), np.zeros((1, 3)), cycle)
     assert found.labels.tolist()[:4] == [LEFT, RIGHT, LEFT, RIGHT]
     assert found.labels[4] == (LEFT if follows else UNKNOWN)
-
-
-def test_near_cones_are_means_of_their_detections() -> None:
-    near = NearCones()
-    first = near.add(0.0, np.array([[0.0, 0.0], [5.0, 0.0]]), np.array([LEFT, UNKNOWN]))
-    second = near.add(0.1, np.array([[5.2, 0.0], [0.0, 0.3], [9.0, 9.0]]), np.array([RIGHT, LEFT, UNKNOWN]))
-    np.testing.assert_array_equal(first, [0, 1])
-    np.testing.assert_array_equal(second, [1, 0, 2])
-    np.testing.assert_allclose(near.points, [[0.0, 0.15], [5.1, 0.0], [9.0, 9.0]])
-    np.testing.assert_array_equal(near.counts, [2, 2, 1])
-    np.testing.assert_array_equal(near.votes, [[2, 0], [0, 1], [0, 0]])
-
-
-def test_near_cones_are_forgotten_once_they_are_old() -> None:
-    near = NearCones()
-    near.add(0.0, np.zeros((1, 2)), np.array([LEFT]))
-    near.add(FORGET_AFTER + 0.1, np.ones((1, 2)), np.array([LEFT]))
-    np.testing.assert_array_equal(near.points, [[1.0, 1.0]])
-
-
-def test_two_detections_of_a_new_cone_in_one_cycle_are_two_cones() -> None:
-    near = NearCones()
-    np.testing.assert_array_equal(near.add(0.0, np.zeros((2, 2)), np.array([LEFT, LEFT])), [0, 1])
 
 
 def test_a_cycle_without_detections_is_possible() -> None:

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.noise import TwistNoise
+from pathspace_graph.factors.se2 import relative, to_map
 from pathspace_graph.front_end.motion import MotionCheck, Standstill
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.labels import LEFT
@@ -174,6 +176,30 @@ def test_detections_before_other_noise_are_not_compared() -> None:
         check.set_noise(TwistNoise(TWIST_SIGMA))
         later = motions(true, true, seed + 100, 1.1 * cones, check=check)
         assert not any(is_rest(motion) for motion in later)
+
+
+def test_the_gains_are_those_of_the_nearest_detections() -> None:
+    """The kernel's oracle: whitened squares of all pairs, in the frame of each hypothesis."""
+    rng, shares, most, sigma = np.random.default_rng(0), (0.0, 0.25, 0.5, 1.0), 9.0, 0.05
+    points, pose = rng.uniform(-2.0, 8.0, (9, 2)), np.array([0.6, 0.1, 0.05])
+    spread = 0.1 * rng.standard_normal((9, 2, 2))
+    covariances = spread @ spread.transpose(0, 2, 1) + 0.01 * np.eye(2)
+    others = [(points + 0.1 * rng.standard_normal((9, 2)), np.zeros(3)), (points[:4] + 0.2, 0.5 * pose)]
+    expected = []
+    for resting, before in others:
+        way = relative(pose, before)
+        moved, gains = to_map(resting, way[None]), []
+        view = np.hypot(*resting.T).max() - np.hypot(way[0], way[1])
+        for share in shares:
+            off = points[:, None] - (1.0 - share) * resting - share * moved
+            precision = np.linalg.inv(2.0 * covariances + sigma**2 * np.eye(2))
+            squares = np.einsum("mni,mij,mnj->mn", off, precision, off).min(axis=1)
+            gains.append((np.hypot(*points.T) <= view) * np.maximum(most - squares, 0.0))
+        expected.append([*np.sum(gains, axis=1), ((gains[0] - gains[-1]) ** 2).sum()])
+    found = kernels.standstill_gains(points, covariances, pose, others, shares, sigma, most)
+    assert np.min(expected) > 0.0
+    np.testing.assert_allclose(found.T, expected, rtol=1e-9, atol=1e-12)
+    assert kernels.standstill_gains(points, covariances, pose, [], shares, sigma, most).shape == (5, 0)
 
 
 GAIN = 9.0

@@ -115,18 +115,6 @@ def test_a_flipped_byte_of_a_header_or_a_map_is_read_or_refused(
         file.write_bytes(good)
 
 
-@pytest.mark.parametrize("name", ["log.toml", *COLUMNS])
-def test_a_log_that_was_half_written_is_refused(name: str, tmp_path: Path) -> None:
-    write_log(small_log(), tmp_path / "log")
-    file = tmp_path / "log" / name
-    file.write_text(file.read_text()[: len(file.read_text()) * 6 // 10])
-    if name.startswith("truth_") and name != "truth_associations.csv":
-        return  # a shorter truth is a truth
-    with pytest.raises(InputError) as refused:
-        read_log(tmp_path / "log")
-    assert refused.value.file == file
-
-
 def test_a_damaged_cell_of_a_study_is_run_again(tmp_path: Path) -> None:
     cell = make_plan(Study(tracks=(write_round_track(tmp_path),))).cells[0]
     record = cell.failed(ValueError("lost")) | {"rows": [{"lap": 1, "rmse": 0.123456}]}

@@ -9,6 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
+import pymap3d
 import pytest
 from numpy.typing import NDArray
 
@@ -30,7 +31,6 @@ from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.spline.planning import speed_profile
 
 from ..scenes.maps import open_map, point_map, ring_map
-from .test_local_plane import to_map
 
 Array = NDArray[np.float64]
 
@@ -227,3 +227,52 @@ def test_what_needs_two_curves_says_so(tmp_path: Path) -> None:
             write_lanelet2(tmp_path / "map.osm", track, 1.0, PLANE)
         with pytest.raises(SettingsError, match=f"expected a curve as .* boundary, found {found}"):
             track.centre_line()
+
+
+# --- latitude and longitude ------------------------------------------------------------------------------
+
+
+def to_map(plane: LocalPlane, geodetic: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (n, 2) of the map in m; the foot of a point on the ellipsoid is 3 mm off at 7 km."""
+    origin = plane.latitude, plane.longitude, 0.0
+    east, north, _ = pymap3d.geodetic2enu(*geodetic.T, np.zeros(len(geodetic)), *origin)
+    s, c = np.sin(np.radians(plane.heading)), np.cos(np.radians(plane.heading))
+    return np.column_stack([s * east + c * north, s * north - c * east])
+
+
+ORIGINS = [
+    (0.0, 0.0, 0.0),
+    (48.1, 11.5, 30.0),
+    (-33.9, 151.2, -120.0),
+    (71.0, 180.0, 359.0),
+    (-89.0, -45.0, 90.0),
+]
+
+
+@pytest.mark.parametrize("origin", ORIGINS)
+def test_round_trip(origin: tuple[float, float, float]) -> None:
+    plane = LocalPlane(*origin)
+    points = np.random.default_rng(0).uniform(-5000.0, 5000.0, (200, 2))
+    assert to_map(plane, plane.to_geodetic(points)) == pytest.approx(points, abs=4e-3)
+
+
+@pytest.mark.parametrize(
+    ("heading", "east", "north"), [(0.0, 0.0, 1.0), (90.0, 1.0, 0.0), (180.0, 0.0, -1.0), (-90.0, -1.0, 0.0)]
+)
+def test_x_points_along_the_heading_clockwise_from_north(heading: float, east: float, north: float) -> None:
+    moved = LocalPlane(48.0, 11.0, heading).to_geodetic(np.array([[1000.0, 0.0]]))[0] - [48.0, 11.0]
+    assert np.sign(np.round(moved, 4)) == pytest.approx([north, east])
+
+
+@pytest.mark.parametrize(
+    ("origin", "name"),
+    [
+        ((90.0, 0.0, 0.0), "latitude"),
+        ((np.nan, 0.0, 0.0), "latitude"),
+        ((0.0, 181.0, 0.0), "longitude"),
+        ((0.0, 0.0, np.inf), "heading"),
+    ],
+)
+def test_an_origin_that_is_none(origin: tuple[float, float, float], name: str) -> None:
+    with pytest.raises(SettingsError, match=f"expected a {name}"):
+        LocalPlane(*origin)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import subprocess
 import sys
@@ -37,12 +36,6 @@ def test_new_folder_with_its_parents(tmp_path: Path) -> None:
     write_result(tmp_path / "a" / "b", "1")
     assert (tmp_path / "a" / "b" / "marker").read_text() == "1"
     assert names(tmp_path / "a") == ["b"]
-
-
-def test_empty_folder_is_used(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    write_result(tmp_path / "out", "1")
-    assert names(tmp_path) == ["out"]
 
 
 @pytest.mark.parametrize("system", ["Linux", "other"])
@@ -247,33 +240,21 @@ def test_a_folder_that_cannot_be_written_is_refused_beforehand(
         check_target(tmp_path / "new" / "map", "map.json")
 
 
-def test_arrays_scalars_tuples_and_paths_become_plain_values(tmp_path: Path) -> None:
-    content = {
-        "array": np.array([[1.5, 2.0]]),
-        "scalars": (np.float64(0.1), np.int64(3), np.bool_(True)),
-        "path": Path("a/b"),
-        "nothing": None,
-        4: "a key that is a number",
-    }
+def test_what_json_lacks_is_written_as_plain_values(tmp_path: Path) -> None:
+    content = [
+        np.nan,
+        np.inf,
+        {4: -np.inf},
+        np.array([[np.nan, 1.5]]),
+        (np.int64(3), np.bool_(True)),
+        Path("a/b"),
+    ]
     write_json(tmp_path / "f.json", content)
-    read = json.loads((tmp_path / "f.json").read_text())
-    assert read == {
-        "array": [[1.5, 2.0]],
-        "scalars": [0.1, 3, True],
-        "path": "a/b",
-        "nothing": None,
-        "4": "a key that is a number",
-    }
-
-
-def test_nan_becomes_null_and_infinity_a_text(tmp_path: Path) -> None:
-    write_json(tmp_path / "f.json", [np.nan, np.inf, {"low": -np.inf}, np.array([np.nan])])
-    assert read_json(tmp_path / "f.json", "a list") == [None, "inf", {"low": "-inf"}, [None]]
-
-
-def test_what_cannot_be_written_leaves_the_earlier_file(tmp_path: Path) -> None:
-    write_json(tmp_path / "f.json", [1])
-    with pytest.raises(TypeError):
-        write_json(tmp_path / "f.json", {"a": object()})
-    assert [path.name for path in tmp_path.iterdir()] == ["f.json"]
-    assert read_json(tmp_path / "f.json", "a list") == [1]
+    assert read_json(tmp_path / "f.json", "a list") == [
+        None,
+        "inf",
+        {"4": "-inf"},
+        [[None, 1.5]],
+        [3, True],
+        "a/b",
+    ]

@@ -38,7 +38,7 @@ def test_the_limits_of_depth_and_of_whole_numbers_are_exact() -> None:
     ("parse", "text"),
     [
         (parse_json, "[" * 1_000_000),
-        (parse_json, '{"a":' * 100_000),
+        (parse_json, '{\n"format": \n'),
         (parse_toml, "a = " + "[" * 100_000),
         (parse_toml, ".".join(["a"] * 3000) + " = 1"),
         (parse_yaml, "[" * 1_000_000),

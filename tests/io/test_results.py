@@ -14,7 +14,7 @@ from pathspace_graph.errors import InputError
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.io.results import SMOOTHED_FILE, CycleRecord, RunResult, write_result, write_trajectory
-from pathspace_graph.io.tables import read_trajectory
+from pathspace_graph.io.tables import read_table, read_trajectory
 from pathspace_graph.labels import LEFT
 
 
@@ -90,3 +90,40 @@ def test_a_comment_is_left_out_and_a_wrong_row_is_named(tmp_path: Path) -> None:
         read_trajectory(file)
     with pytest.raises(InputError, match=r"none\.tum: expected a trajectory"):
         read_trajectory(tmp_path / "none.tum")
+
+
+# --- rows that are too long ------------------------------------------------------------------------------
+
+
+POSE = "0.1 1 2 0 0 0 0 1"
+
+
+@pytest.mark.parametrize(
+    ("text", "row"),
+    [
+        (f"{POSE} 5\n{POSE}\n", 1),
+        (f"{POSE} 5 6\n{POSE}\n", 1),
+        (f"{POSE}\n{POSE} 5\n", 2),
+        (f"{POSE}\n{POSE} 5 6 7\n", 2),
+    ],
+)
+def test_a_pose_with_more_fields_is_refused_by_its_row(text: str, row: int, tmp_path: Path) -> None:
+    (tmp_path / "trajectory.tum").write_text(text)
+    with pytest.raises(InputError, match=rf"trajectory\.tum, row {row}: expected 8 fields, found"):
+        read_trajectory(tmp_path / "trajectory.tum")
+
+
+def test_a_quote_that_is_not_closed_is_told(tmp_path: Path) -> None:
+    (tmp_path / "trajectory.tum").write_text(f'{POSE}\n0 0 2 0 0 0 8 " ')
+    with pytest.raises(InputError, match=r"trajectory\.tum.*expected a table of texts"):
+        read_trajectory(tmp_path / "trajectory.tum")
+
+
+def test_a_header_quoted_over_lines_with_more_fields_than_its_first_line_is_refused(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "table.csv").write_text('a,"b\nc",d\n1,2,3\n')
+    assert list(read_table(tmp_path / "table.csv").columns) == ["a", "b\nc", "d"]
+    (tmp_path / "table.csv").write_text('a,"b\nc",d,e\n1,2,3,4\n')
+    with pytest.raises(InputError, match=r"table\.csv, row 1: expected 2 fields, found more"):
+        read_table(tmp_path / "table.csv")

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.filters import make_periodic
 from pathspace_graph.eval.metrics.accuracy import cone_distances
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.mapper import Knots, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import ClosingSettings
 from pathspace_graph.spline.boundary import relocate
 
@@ -133,22 +132,6 @@ def test_readings_in_use_lie_on_the_closed_curve(run: tuple[FixedLagMapper, list
         assert foot.interior.all()
         assert np.median(np.abs(foot.distance)) < 0.02
         assert np.abs(foot.distance).max() < 0.1
-
-
-def test_knots_by_the_cones_are_nearer_to_them_than_knots_by_curvature(before: FixedLagMapper) -> None:
-    """Of the same number of control points, and where a cone asks for one."""
-    before.road.smoother.reactivate()
-    state, settings = before.road.smoother.map.state, before.settings
-    kinds: tuple[Knots, Knots] = ("cones", "curvature")
-    for label, boundary in state.boundaries.items():
-        points = state.control_points(label)
-        periodic = [make_periodic(boundary, points, settings, kind) for kind in kinds]
-        assert len(periodic[0].points) == len(periodic[1].points)
-        u = np.array(boundary.cone_parameters)
-        u = u[u < periodic[0].overlap.period - 1.0]
-        cones = boundary.evaluate(points, u)
-        off = [np.hypot(*(boundary.closed(new.knots).evaluate(new.points, u) - cones).T) for new in periodic]
-        assert np.sqrt(np.mean(off[0] ** 2)) < 0.8 * np.sqrt(np.mean(off[1] ** 2))
 
 
 # --- where it mustn't ------------------------------------------------------------------------------------

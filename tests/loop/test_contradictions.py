@@ -14,7 +14,7 @@ from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.known_loop import Loop, is_mapped
-from pathspace_graph.loop.map_repair import CERTAIN, SETTLE, SIGHTINGS, Contradictions, in_rows
+from pathspace_graph.loop.map_repair import CERTAIN, SETTLE, SIGHTINGS, MapRepair
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -41,12 +41,12 @@ def seen(
     cones: Sequence[Sequence[float]],
     label: int = LEFT,
     times: int = SIGHTINGS,
-    found: Contradictions | None = None,
+    found: MapRepair | None = None,
     sigmas: tuple[float, float] = (0.1, 0.1),
-) -> Contradictions:
+) -> MapRepair:
     """Contradictions after cones were detected from a vehicle that stands at the origin; it has no map."""
     mapper = FixedLagMapper()
-    found = found or Contradictions(SETTINGS.growth)
+    found = found or MapRepair(SETTINGS)
     smoother, points = mapper.road.smoother, np.array(cones, float)
     smoother.variables.insert(pose_keys(np.arange(1)), np.zeros(3))
     smoother.times.append(0.0)
@@ -110,14 +110,8 @@ def test_cones_in_a_gap_count_wherever_the_bridge_over_it_is() -> None:
 
 def test_nothing_is_left_once_the_map_was_replaced() -> None:
     found = seen(ROW)
-    found.clear()
+    found.tracks.clear()
     assert found.stretches(lane(), LATER) == []
-
-
-def test_points_are_in_a_row_with_all_that_their_neighbours_are_in_a_row_with() -> None:
-    points = np.array([[0.0, 0.0], [30.0, 0.0], [9.0, 0.0], [18.0, 0.0], [35.0, 0.0]])
-    assert sorted(row.tolist() for row in in_rows(points, 10.0)) == [[0, 2, 3], [1, 4]]
-    assert in_rows(np.zeros((0, 2)), 10.0) == []
 
 
 def test_a_gap_is_where_neighbours_are_much_farther_apart_than_others() -> None:

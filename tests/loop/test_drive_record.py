@@ -41,7 +41,7 @@ def on_circle(angle: Array, side: float = 0.0) -> Array:
 
 def driven(laps: float, drift: float) -> DriveRecord:
     """Returns the record of a circle, driven for some laps; its odometry turns by `drift` rad/m too much."""
-    record, road = DriveRecord(MapperSettings()), Road(MapperSettings())
+    record, road = DriveRecord(), Road(MapperSettings())
     state, end = road.smoother.map.state, 2.0 * np.pi * laps
     state.variables.insert(pose_keys(np.arange(1)), np.zeros(3))
     angles = np.arange(0.0, end + 0.3, 3.0 / RADIUS)
@@ -96,7 +96,7 @@ def test_a_lap_is_solved_with_the_noise_that_is_known_when_it_closes() -> None:
     """Cycle 0 was driven with the stated noise, before any was measured: it counts as the others do."""
     stated, drift = np.array([0.01, 0.01, 0.002]), np.array([0.05, 0.05, 0.0017])
     front_end = FrontEnd(MapperSettings(noise="measured"), KnownNoise(stated))
-    noise, record = front_end.noise, DriveRecord(MapperSettings())
+    noise, record = front_end.noise, DriveRecord()
     cone = Detections(0.2, np.array([[6.0, 2.0]]), 1e-4 * np.eye(2)[None], np.array([LEFT]))
     twist = np.array([[SPEED, 0.0, 0.3]] * 4)
     for k in range(2):

@@ -168,6 +168,5 @@ def test_factors_of_the_user_may_tell_the_gauge_so_that_it_is_not_held() -> None
 def test_a_map_that_replaces_another_has_a_gauge_of_its_own() -> None:
     smoother = run(0.1, mid()).road.smoother
     assert smoother.held is not None
-    keys = smoother.map.state.map_keys
-    restart(smoother, smoother.first_cycle, keys, keys, smoother.variables.of(keys).reshape(-1, 2))
+    restart(smoother, smoother.first_cycle)
     assert smoother.held is None

@@ -91,13 +91,16 @@ def test_a_replay_takes_the_recorded_ends_in_their_turn(sent: list[Lap]) -> None
     assert one.ends(700) == (327, 645)
 
 
-def test_a_batch_that_is_late_when_the_drive_ends_is_recorded_past_its_last_cycle(sent: list[Lap]) -> None:
+def test_a_batch_that_is_late_when_the_drive_ends_is_recorded_past_its_last_cycle(
+    sent: list[Lap], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """So a replay does not use it in its last cycle either."""
-    one = solver(late=30)
+    monkeypatch.setattr("pathspace_graph.loop.lap_solver.MOST_LATE", 30)
+    one = solver()
     begin(one, 270, 300)
     assert one.ends(320) == ()
     assert one.ends(321) == (351,)
-    again = solver(late=30, ends=(351,))
+    again = solver(ends=(351,))
     begin(again, 270, 300)
     sent[-1].set_result(solved(1.0))
     assert outcome(again, 350, 270) is None

@@ -27,7 +27,7 @@ from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import worker
 from pathspace_graph.loop.lap_solver import LONGEST_WAIT
 from pathspace_graph.loop.map_repair import REPAIRED
-from pathspace_graph.loop.open import STAYS_OPEN, Open
+from pathspace_graph.loop.open import STAYS_OPEN, ReturnFinder, Revisits
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -218,7 +218,8 @@ def test_a_batch_that_never_ends_is_given_up_and_the_window_is_the_lag_again(
 ) -> None:
     ended: list[bool] = []
     monkeypatch.setattr(worker, "_end_worker", lambda: ended.append(True))
-    mapper = with_settings(late=12, retry=1e3)  # the next one would be sent at once
+    monkeypatch.setattr("pathspace_graph.loop.lap_solver.MOST_LATE", 12)
+    mapper = with_settings(retry=1e3)  # the next one would be sent at once
     results = drive(mapper, sent, NEVER, log())
     end = due_cycle(sent[0]) + 13
     notices = {k: result.notice for k, result in enumerate(results) if result.notice}
@@ -227,7 +228,7 @@ def test_a_batch_that_never_ends_is_given_up_and_the_window_is_the_lag_again(
     assert mapper.batches().ends == (end,)
     assert ended == [True]
     assert len(mapper.poses) == 31
-    replayed = with_settings(late=12, retry=1e3, ends=(end,))
+    replayed = with_settings(retry=1e3, ends=(end,))
     run_online(log(), replayed)  # waits for nothing, since the batch ends in no cycle
     assert_same(replayed, mapper)
 
@@ -275,6 +276,26 @@ def test_a_process_ends_though_its_own_one_for_laps_is_idle(tmp_path: Path) -> N
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="Windows")
+def test_the_process_starts_with_the_mapper_and_cycles_submit_laps_only(
+    stem: Stem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submitted = list[Work]()
+
+    def submit(work: Work, *_: Any) -> Future[Any]:
+        submitted.append(work)
+        return Future()
+
+    monkeypatch.setattr(worker, "submit", submit)
+    FixedLagMapper()
+    assert submitted == [worker.nothing]
+    mapper = stem.mapper()
+    for odometry, cycle in stem.rest(log()):
+        mapper.update(odometry, cycle)
+        if mapper.drive.solver.is_busy:
+            break
+    assert submitted[1:] == [solve_lap]
+
+
 def test_an_interrupt_does_not_reach_the_process_of_the_batch_and_reaches_this_one() -> None:
     """Ctrl-C goes to all processes of a terminal; one that is still importing would print where it was."""
     if worker._worker.cache_info().currsize:
@@ -404,7 +425,8 @@ def test_nothing_changes_before_a_batch_agrees(
                 is_singular(batch)
         refused.update(*cycle)
     assert len(sent) >= 1 and not refused.closed
-    monkeypatch.setattr(Open, "_begin_batch", lambda *_: None)
+    for finder in (ReturnFinder, Revisits):
+        monkeypatch.setattr(finder, "find", lambda *_: None)
     for cycle in stem.rest(log()):
         open_map.update(*cycle)
     assert not open_map.closed

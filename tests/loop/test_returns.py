@@ -1,4 +1,4 @@
-"""When the search for a return is due: near the beginning, some metres or cycles after the last attempt."""
+"""When the search for a return is due: some metres or cycles after the last attempt."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ STEP = MapperSettings().closing.check_interval
 def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return a list that gets what is tried."""
     ways: list[str] = []
-    monkeypatch.setattr(open_road, "unwrap", lambda poses: poses)
     monkeypatch.setattr(
         open_road,
         "return_to_beginning",
@@ -29,8 +28,8 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ways
 
 
-def searched(finder: ReturnFinder, cycle: int, length: float, is_near: bool = True) -> None:
-    """Search on a road near its beginning, or far from it, with a curve whose first 30 m count."""
+def searched(finder: ReturnFinder, cycle: int, length: float) -> None:
+    """Search on a road with a curve whose first 30 m count."""
     line = BSpline.open_uniform(np.column_stack([np.arange(9.0), np.zeros(9)]))
     smoother = SimpleNamespace(
         variables=SimpleNamespace(sensor=None),
@@ -39,8 +38,8 @@ def searched(finder: ReturnFinder, cycle: int, length: float, is_near: bool = Tr
         refresh=lambda: None,
         map=SimpleNamespace(state=SimpleNamespace(splines={0: line})),
     )
-    path = SimpleNamespace(length=length, near_beginning=lambda *_: is_near)
-    record = SimpleNamespace(seen_in=lambda *_: None, poses=None, with_window=lambda _: None)
+    path = SimpleNamespace(length=length, near_beginning=lambda *_: True)
+    record = SimpleNamespace(seen_in=lambda *_: None, with_newest_path=lambda *_: None)
     boundaries = {0: SimpleNamespace(confirmed_end=50.0)}
     road = {
         "path": path,
@@ -78,8 +77,3 @@ def test_nothing_is_tried_in_a_rest(tried: list[str]) -> None:
     assert tried == []
     searched(finder, 2, 120.0)
     assert len(tried) == 1
-
-
-def test_far_from_the_beginning_nothing_is_tried(tried: list[str]) -> None:
-    searched(ReturnFinder(MapperSettings()), 1, 100.0, is_near=False)
-    assert tried == []

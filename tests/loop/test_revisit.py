@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from types import SimpleNamespace
@@ -24,9 +25,10 @@ from pathspace_graph.loop import drive as drive_module
 from pathspace_graph.loop import open as open_road
 from pathspace_graph.loop.drive import Drive, DriveRecord, Step
 from pathspace_graph.loop.lap_solver import Outcome
-from pathspace_graph.loop.open import NOT_REVISITED, Open, Revisits, earlier_pass
+from pathspace_graph.loop.open import NOT_REVISITED, TOO_LONG, Open, Revisits, earlier_pass
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
+from pathspace_graph.mapping.state import GivenFactor
 from pathspace_graph.run import CycleResult
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
@@ -139,6 +141,13 @@ def test_the_map_is_better_for_them_and_nothing_is_closed(monkeypatch: pytest.Mo
     assert smoothed.mean() < 0.5 * alone.mean()
 
 
+def test_the_map_of_a_long_open_road_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(open_road, "MOST_LAID_ON", 10)
+    mapper, results = map_log(drive())
+    assert [one.notice for one in results if "not used" in one.notice] == [f"{NOT_REVISITED}: {TOO_LONG}"]
+    assert mapper.revisits == () and all(one.jump is None for one in results)
+
+
 @dataclass(frozen=True)
 class Replaced:
     """An open road just before and after a batch has replaced its map."""
@@ -155,15 +164,15 @@ def replaced() -> list[Replaced]:
     found, take = list[Replaced](), drive_module.lay_on
     """The priors of the calibrations have changed since each batch began."""
 
-    def lay_on(road: Road, marginal: LapMarginal) -> Array:
+    def lay_on(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor]) -> Array:
         before, after = road.copy(), road.copy()
         before.smoother.transform_to_origin()
         mean, sigma = after.smoother.calibration_prior
         after.smoother.set_calibration_priors(mean + 0.1 * sigma, 0.5 * sigma)
         with pytest.MonkeyPatch.context() as without_steps:
             without_steps.setattr(CurveSmoother, "step", lambda *_: None)
-            found.append(Replaced(marginal, before, after, take(after, marginal)))
-        return take(road, marginal)
+            found.append(Replaced(marginal, before, after, take(after, marginal, given)))
+        return take(road, marginal, given)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drive_module, "lay_on", lay_on)

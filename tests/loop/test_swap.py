@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cache
@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
-from pathspace_graph.factors.se2 import relative, wrap_angle
+from pathspace_graph.factors.gtsam_factors import boundary_point_factor
+from pathspace_graph.factors.se2 import left_of, relative, wrap_angle
 from pathspace_graph.graph.gaussian import normal_equations
-from pathspace_graph.graph.variables import Layout, Variables, pose_keys
+from pathspace_graph.graph.variables import CALIBRATION_KEY, Layout, Variables, pose_keys
 from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import drive as drives
 from pathspace_graph.loop import worker
@@ -29,6 +30,7 @@ from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.loop.open import STAYS_OPEN
 from pathspace_graph.mapping.road import HELD, Road
 from pathspace_graph.mapping.smoother import CurveSmoother
+from pathspace_graph.mapping.state import GivenFactor
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -149,8 +151,8 @@ def swapped() -> tuple[Swap, OpenLap]:
     calibrations: list[Array] = []
     take, record, associate = drives.swap_in, DriveRecord.lap, CurveSmoother.reassociate
 
-    def swap_in(road: Road, marginal: LapMarginal) -> Array:
-        jump = take(road, marginal)
+    def swap_in(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor]) -> Array:
+        jump = take(road, marginal, given)
         swaps.append(swap_of(road.smoother, marginal, calibrations[-1]))
         return jump
 
@@ -230,14 +232,17 @@ def test_poses_are_held_until_the_swap_where_the_window_empties_faster() -> None
 
 
 @pytest.mark.parametrize(
-    ("limits", "reason"),
+    ("limit", "most", "reason"),
     [
-        ({"max_cycles": 50}, "the lap is too long for a batch"),
-        ({"max_cones": 20}, "the lap has too many cones for a batch"),
+        ("drive.MOST_CYCLES", 50, "the lap is too long for a batch"),
+        ("open.MOST_CONES", 20, "the lap has too many cones for a batch"),
     ],
 )
-def test_a_lap_without_a_batch_stays_open_and_says_why(limits: dict[str, float], reason: str) -> None:
-    mapper, results = map_log(log(), FixedLagMapper(with_settings(**limits)))
+def test_a_lap_without_a_batch_stays_open_and_says_why(
+    limit: str, most: int, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"pathspace_graph.loop.{limit}", most)
+    mapper, results = map_log(log(), FixedLagMapper())
     assert not mapper.closed
     assert [result.notice for result in results if result.notice] == [f"{STAYS_OPEN}: {reason}"]
     assert all(result.jump is None for result in results)
@@ -308,20 +313,58 @@ def test_the_batch_of_the_lap_has_the_users_factors_on_poses() -> None:
     assert abs(error(poor) - error(usual)) < 0.01  # the loop closes a cycle later
 
 
-def test_a_users_factor_on_control_points_keeps_the_loop_open_and_it_is_said() -> None:
-    mapper, results = FixedLagMapper(), []
-    noise = gtsam.noiseModel.Isotropic.Sigma(2, 0.5)
-    for cycle, (odometry, detections) in enumerate(split_odometry(log())):
+ASIDE = 0.4  # of a surveyed point from the left curve (m)
+
+
+@cache
+def surveyed(cycle: int) -> tuple[Mapped, Array]:
+    """A drive whose left curve is said, in a cycle, to pass a point aside of it, and that point."""
+    mapper, results, point = FixedLagMapper(None, log().noise), list[CycleResult](), np.zeros(2)
+    for k, (odometry, detections) in enumerate(split_odometry(log())):
         given = []
-        if cycle == 20:
-            keys = int(mapper.next_pose_key), int(mapper.control_keys(LEFT)[0])
-            given = [gtsam.BearingRangeFactor2D(*keys, gtsam.Rot2(0.0), 3.0, noise)]
+        if k == cycle:
+            boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
+            u = np.array([0.5 * boundary.confirmed_end])
+            tangent = boundary.evaluate(points, u, 1)
+            point = boundary.evaluate(points, u) + ASIDE * left_of(tangent) / np.hypot(*tangent.T)
+            sides = {"low": u - 4.0, "high": u + 4.0, "sigma": np.array([1e-3])}
+            keys = mapper.control_keys(LEFT)
+            given = [boundary_point_factor(keys, boundary.tables, points_map=point, **sides)]
+        mapper.wait()
         results.append(mapper.update(odometry, detections, given))
-    assert not mapper.closed
-    said = "; ".join(result.notice for result in results if result.notice)
-    why = "the user's factors hold control points, and a batch has other ones"
-    assert said == f"{HELD}; {STAYS_OPEN}: {why}"
-    assert all(result.jump is None for result in results)
+    return (mapper, results), point
+
+
+def off_left(mapper: FixedLagMapper, point: Array) -> float:
+    """Distance (m) of the left curve from a point (1, 2)."""
+    boundary, points = mapper.boundaries[LEFT], mapper.control_points(LEFT)
+    return float(np.abs(boundary.find_anywhere(points, point).distance[0]))
+
+
+@pytest.mark.parametrize("before", [60, 4])
+def test_a_factor_on_control_points_is_in_the_map_of_the_closed_loop(before: int) -> None:
+    """It is given so many cycles before the swap: the batch has the earlier one, the map the later one."""
+    cycle = closing_cycle(run()[1]) - before
+    (mapper, results), point = surveyed(cycle)
+    assert mapper.closed and mapper.failures == 0
+    assert {result.notice for result in results if result.notice} == {HELD}
+    held = [one.cycle for one in mapper.drive.record.factors]
+    assert held == [cycle] and mapper.road.smoother.user_factors.factors == []
+    assert off_left(run()[0], point) > 0.5 * ASIDE
+    assert off_left(mapper, point) < 0.2 * ASIDE  # few control points pass it by some centimetres
+
+
+def test_a_factor_on_the_calibration_counts_once_after_the_loop_has_closed() -> None:
+    """It stays a variable, so the factor could be in the window and in the marginal."""
+    mapper, sigma = FixedLagMapper(None, log().noise), 1e-5
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
+    for k, (odometry, detections) in enumerate(split_odometry(log())):
+        known = gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.zeros(2), noise)
+        mapper.wait()
+        mapper.update(odometry, detections, [known] if k == 5 else [])
+    assert mapper.closed
+    sigmas = np.sqrt(np.diag(mapper.marginal_covariance([CALIBRATION_KEY])))
+    np.testing.assert_allclose(sigmas, sigma, rtol=0.05)  # counted twice it would be 0.71 of that
 
 
 def test_the_poses_of_the_lap_are_corrected_as_soon_as_the_loop_closes() -> None:

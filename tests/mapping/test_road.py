@@ -18,7 +18,7 @@ def road_with_cones() -> Road:
     road = Road(MapperSettings())
     for x in (0.0, 1.0, 2.0):
         road.path.update(np.array([x, 0.0, 0.0]))
-    road.growth.tentative[LEFT].add(SEEN, np.tile(0.01 * np.eye(2), (2, 1, 1)), 0.0)
+    road.growth.tentative.add(SEEN, np.tile(0.01 * np.eye(2), (2, 1, 1)), np.array([LEFT, LEFT]), 0.0)
     return road
 
 
@@ -27,7 +27,7 @@ def test_what_is_no_variable_moves_with_the_open_map() -> None:
     driven = road.path.points
     road.move(MOTION)
     np.testing.assert_allclose(road.path.points, move_points(MOTION, driven), atol=1e-12)
-    np.testing.assert_allclose(road.growth.tentative[LEFT].points, move_points(MOTION, SEEN), atol=1e-12)
+    np.testing.assert_allclose(road.growth.tentative.points, move_points(MOTION, SEEN), atol=1e-12)
 
 
 def test_a_copy_moves_alone() -> None:
@@ -35,5 +35,5 @@ def test_a_copy_moves_alone() -> None:
     other, driven = road.copy(), road.path.points
     other.move(MOTION)
     np.testing.assert_array_equal(road.path.points, driven)
-    np.testing.assert_array_equal(road.growth.tentative[LEFT].points, SEEN)
-    np.testing.assert_allclose(other.growth.tentative[LEFT].points, move_points(MOTION, SEEN), atol=1e-12)
+    np.testing.assert_array_equal(road.growth.tentative.points, SEEN)
+    np.testing.assert_allclose(other.growth.tentative.points, move_points(MOTION, SEEN), atol=1e-12)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import pickle
+
+import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.graph.variables import CALIBRATION_KEY, control_keys, pose_keys
+from pathspace_graph.graph.rows import at_values
+from pathspace_graph.graph.variables import CALIBRATION_KEY, control_keys, pose_key, pose_keys, sizes
+from pathspace_graph.graph.window import user_rows
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.state import GivenFactor, State
 from pathspace_graph.settings.mapper import MapperSettings, SplineSettings
-from pathspace_graph.spline.boundary import open_boundary
+from pathspace_graph.spline.boundary import Boundary, open_boundary
 
 from ..scenes.maps import boundary_through
 
@@ -42,7 +47,8 @@ def test_boundaries_lie_in_the_order_of_their_labels(state: State) -> None:
     assert list(state.boundaries) == [LEFT, RIGHT]
     left, right = state.control_points(LEFT), state.control_points(RIGHT)
     np.testing.assert_array_equal(state.map_points, np.concatenate([left, right]))
-    np.testing.assert_array_equal(state.map_keys, np.concatenate([state.keys(LEFT), state.keys(RIGHT)]))
+    keys = [state.control_keys(label) for label in (LEFT, RIGHT)]
+    np.testing.assert_array_equal(state.map_keys, np.concatenate(keys))
     np.testing.assert_allclose(left[:, 1], 2.0, atol=1e-6)
 
 
@@ -72,7 +78,7 @@ def test_a_boundary_that_has_grown_gets_active_control_points_at_its_end(state: 
     state.extend(LEFT, points[size:])
     assert len(state.control_points(LEFT)) == boundary.size > size
     assert state.active(LEFT).tolist() == list(range(4, boundary.size))
-    np.testing.assert_array_equal(state.keys(LEFT), control_keys(LEFT, np.arange(boundary.size)))
+    np.testing.assert_array_equal(state.control_keys(LEFT), control_keys(LEFT, np.arange(boundary.size)))
     assert state.active(RIGHT) is state.boundaries[RIGHT].everything
 
 
@@ -103,7 +109,7 @@ def test_foot_points_on_both_curves_are_those_on_each_alone(state: State) -> Non
             refined.u[own], boundary.refine(control, points[own], u[own]).u, atol=1e-12
         )
         keys = state.curves.keys[found.columns[own]]
-        np.testing.assert_array_equal(keys, state.keys(label)[boundary.columns(alone.span)])
+        np.testing.assert_array_equal(keys, state.control_keys(label)[boundary.columns(alone.span)])
 
 
 def test_a_foot_point_before_the_active_stretch_is_noticed(state: State) -> None:
@@ -135,3 +141,74 @@ def test_a_side_that_only_a_batch_has_found_closes_as_well() -> None:
         state.close(label, open_boundary(settings.spline, settings.gauge).closed(knots))
     assert [*state.boundaries] == [LEFT, RIGHT]
     assert state.closed
+
+
+# --- the user's factors on other curves ------------------------------------------------------------------
+
+
+def refined(state: State) -> State:
+    """The same curves on twice as many spans."""
+    finer = state.copy()
+    for label, old in state.boundaries.items():
+        knots = np.union1d(old.knots, 0.5 * (old.knots[1:] + old.knots[:-1]))[old.degree : -old.degree]
+        boundary = Boundary(knots, False, old.settings, old.gauge)
+        boundary.confirmed_end = boundary.tables.high
+        u = np.linspace(boundary.tables.low, boundary.tables.high, 4 * boundary.size)
+        curve = old.evaluate(state.control_points(label), u)
+        finer.replace_boundary(label, boundary, np.linalg.lstsq(boundary.basis(u), curve, rcond=None)[0])
+    return finer
+
+
+def test_a_factor_on_control_points_is_the_same_on_finer_knots(state: State) -> None:
+    """A curve of the coarse knots is one of the fine knots, so its error is exact for any such curve."""
+    rng, noise = np.random.default_rng(0), gtsam.noiseModel.Isotropic.Sigma(2, 0.1)
+    left, right = int(state.control_keys(LEFT)[2]), int(state.control_keys(RIGHT)[4])
+    factor = gtsam.BetweenFactorPoint2(left, right, np.array([3.0, 0.4]), noise)
+    given = GivenFactor.of(factor, state, 7)
+    [rows] = given.on(refined(state))
+    assert given.cycle == 7 and len(rows.keys[0]) > 4
+    state.map_points[:] += 0.1 * rng.normal(size=state.map_points.shape)
+    values = state.variables.gtsam_values(np.array([left, right]))
+    expected = factor.noiseModel().whiten(factor.unwhitenedError(values))
+    np.testing.assert_allclose(at_values(rows, refined(state).variables).residual, expected, atol=1e-6)
+
+
+def test_a_factor_that_came_with_its_pose_is_of_the_cycle_of_the_pose(state: State) -> None:
+    noise, key = gtsam.noiseModel.Isotropic.Sigma(2, 0.1), int(state.control_keys(LEFT)[1])
+    given = GivenFactor.of(gtsam.BearingRangeFactor2D(pose_key(1), key, gtsam.Rot2(), 5.0, noise), state, 7)
+    assert given.cycle == 1
+    [rows] = given.on(state)
+    here = at_values(rows, state.variables)
+    [own] = [at_values(one, state.variables) for one in user_rows([given.factor], state.variables)]
+    np.testing.assert_allclose(here.residual, own.residual, atol=1e-9)
+    by_key = np.isin(here.keys[0], own.keys[0])
+    np.testing.assert_allclose(here.jacobian[:, np.repeat(~by_key, sizes(here.keys[0]))], 0.0, atol=1e-4)
+
+
+def test_a_factor_travels_to_another_process_without_itself(state: State) -> None:
+    """One in Python cannot be pickled."""
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
+        if H is not None:
+            H[0] = np.eye(2, order="F")
+        return np.asarray(values.atPoint2(key))
+
+    key, noise = int(state.control_keys(LEFT)[1]), gtsam.noiseModel.Unit.Create(2)
+    given = GivenFactor.of(gtsam.CustomFactor(noise, [key], error), state, 0)
+    there = pickle.loads(pickle.dumps(given))
+    assert there.factor is None and given.factor is not None
+    np.testing.assert_array_equal(there.on(state)[0].jacobian, given.on(state)[0].jacobian)
+    del state.boundaries[LEFT]
+    assert there.on(state) == []
+
+
+def test_a_factor_without_information_has_no_rows(state: State) -> None:
+    """As that of a surveyed point beyond the end of the curve: its Jacobian is zero."""
+    key, noise = int(state.control_keys(LEFT)[1]), gtsam.noiseModel.Unit.Create(2)
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Array] | None) -> Array:
+        if H is not None:
+            H[0] = np.zeros((2, 2), order="F")
+        return np.zeros(2)
+
+    assert GivenFactor.of(gtsam.CustomFactor(noise, [key], error), state, 0).on(state) == []

@@ -104,11 +104,12 @@ def test_a_boundary_is_not_led_over_cones_of_which_most_readings_have_the_other_
 def test_an_end_nearer_to_an_older_stretch_of_the_path_does_not_follow_that() -> None:
     """An older stretch ran against this one, 3 m to the left of it; what was sighted beside it is its own."""
     mapper, _ = map_log(exact_log(ahead(8.0, 5.0), *corridor(100.0)))
-    boundary, tentative = mapper.boundaries[LEFT], mapper.road.growth.tentative[LEFT]
+    boundary, tentative = mapper.boundaries[LEFT], mapper.road.growth.tentative
     confirmed, size = boundary.confirmed_end, boundary.size
     tentative.clear()
     for t in (5.0, 5.1, 5.2):
-        tentative.add(np.array([[36.0, 1.0], [32.0, 1.0], [28.0, 1.0]]), np.tile(ROUND, (3, 1, 1)), t)
+        points = np.array([[36.0, 1.0], [32.0, 1.0], [28.0, 1.0]])
+        tentative.add(points, np.tile(ROUND, (3, 1, 1)), np.full(3, LEFT), t)
     x = mapper.poses[-1, 0]
     corners = np.array([[60.0, 3.0], [0.0, 3.0], [0.0, 0.0], [x, 0.0], [x + 7.0, 0.0]])
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
@@ -138,8 +139,9 @@ def along_x(driven: float = 0.0, begin: float = -10.0) -> PathAhead:
 def track(mapper: FixedLagMapper, *points: tuple[float, float], label: int = LEFT, times: int = 3) -> None:
     """Makes tentative tracks at points, detected so many times."""
     for k in range(times):
-        mapper.road.growth.tentative[label].add(
-            np.array(points), np.tile(ROUND, (len(points), 1, 1)), 0.1 * k
+        labels = np.full(len(points), label)
+        mapper.road.growth.tentative.add(
+            np.array(points), np.tile(ROUND, (len(points), 1, 1)), labels, 0.1 * k
         )
 
 
@@ -158,7 +160,7 @@ def test_a_curve_begins_with_two_confirmed_tracks_in_the_order_of_the_path(alone
     track(alone, (-2.0, 2.2), (4.0, 2.0), times=3)
     assert grow(alone, along_x()) == [(-2.0, 2.2), (1.0, 2.0), (4.0, 2.0)]
     assert RIGHT not in alone.boundaries
-    assert len(alone.road.growth.tentative[LEFT].points) == 0
+    assert len(alone.road.growth.tentative.points) == 0
     assert len(alone.road.smoother.map.state.pose_u[LEFT]) == len(alone.poses)
 
 
@@ -399,7 +401,7 @@ def far_track(mapper: FixedLagMapper, point: tuple[float, float], sigma: float, 
     """Adds sightings of a cone on the left whose ranges, along x, have this standard deviation (m)."""
     covariance = np.diag([sigma**2, 0.05**2])[None]
     for k in range(times):
-        mapper.road.growth.tentative[LEFT].add(np.array([point]), covariance, 0.1 * k)
+        mapper.road.growth.tentative.add(np.array([point]), covariance, np.array([LEFT]), 0.1 * k)
 
 
 def test_an_uncertain_cone_extends_a_curve_once_it_is_certain(alone: FixedLagMapper) -> None:
@@ -409,7 +411,7 @@ def test_an_uncertain_cone_extends_a_curve_once_it_is_certain(alone: FixedLagMap
     far_track(alone, (6.5, 2.0), 1.2, 3)
     assert len(grow(alone, along_x())) == 2
     far_track(alone, (6.5, 2.0), 1.2, 5)
-    assert alone.road.growth.tentative[LEFT].counts.tolist() == [8]
+    assert alone.road.growth.tentative.counts.tolist() == [8]
     assert len(grow(alone, along_x())) == 2
     far_track(alone, (6.5, 2.0), 0.3, 1)
     assert grow(alone, along_x())[2:] == [(6.5, 2.0)]

@@ -10,7 +10,6 @@ import pytest
 
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import ObservedCycle, run_online
-from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.kidnapped import laps_log, pear_track
 
@@ -18,7 +17,9 @@ FIRST, LAST = 250, 400  # cycles of the second lap, on a closed map
 
 
 @pytest.mark.slow
-def test_a_cycle_on_a_closed_map_leaves_little_more_than_its_row_of_results() -> None:
+def test_a_cycle_on_a_closed_map_leaves_little_more_than_its_row_of_results(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """About 700 bytes for 17 columns, six times of stages and a pose, and some detections for the noise."""
     memory = dict[int, int]()
 
@@ -28,9 +29,8 @@ def test_a_cycle_on_a_closed_map_leaves_little_more_than_its_row_of_results() ->
             gc.collect()
             memory[cycle.number] = tracemalloc.get_traced_memory()[0]
 
-    settings = MapperSettings()
-    short = replace(settings.open_lap, max_cycles=FIRST - 20.0)
-    mapper = FixedLagMapper(replace(settings, open_lap=short))
+    monkeypatch.setattr("pathspace_graph.loop.drive.MOST_CYCLES", FIRST - 20)
+    mapper = FixedLagMapper()
     log = laps_log(pear_track(), 3)
     tracemalloc.start(1)
     try:

@@ -17,9 +17,10 @@ from pathspace_graph.graph.variables import Layout, are_poses, control_keys, pos
 from pathspace_graph.graph.window import as_nonlinear
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.mapping import smoother as curve_smoother
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.mapper import FarSettings, MapperSettings, RelinearizeSettings, SplineSettings
+from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings, SplineSettings
 
 from ..scenes.drives import bean_track, lap_log
 from ..scenes.graph import KEYS, POSE_KEYS, pose_columns, random_factor, random_variables
@@ -29,8 +30,8 @@ IntArray = NDArray[np.intp]
 
 EXACT = RelinearizeSettings(1e-12, 1e-12)
 """Foot points are those of the last step then."""
-EAGER = FarSettings(stretch=5.0, room=3.0)
-"""Parts of the map become inactive early and often."""
+EAGER = 5.0, 3.0
+"""Stretch and room (m) with which parts of the map become inactive early and often."""
 
 
 @pytest.fixture(scope="module")
@@ -42,11 +43,20 @@ def log() -> Log:
     return exact
 
 
-def driven(log: Log, cycles: int, settings: MapperSettings, factors: bool = False) -> FixedLagMapper:
+def driven(
+    log: Log,
+    cycles: int,
+    settings: MapperSettings,
+    factors: bool = False,
+    far: tuple[float, float] = EAGER,
+) -> FixedLagMapper:
     """A mapper after some cycles; `factors`: with a position and a surveyed point of its own."""
     mapper = FixedLagMapper(settings, log.odometry_sigma)
-    for k, (odometry, cycle) in zip(range(cycles), split_odometry(log), strict=False):
-        mapper.update(odometry, cycle, own_factors(mapper) if factors and k == cycles - 5 else ())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(curve_smoother, "FAR_STRETCH", far[0])
+        patch.setattr(curve_smoother, "FAR_ROOM", far[1])
+        for k, (odometry, cycle) in zip(range(cycles), split_odometry(log), strict=False):
+            mapper.update(odometry, cycle, own_factors(mapper) if factors and k == cycles - 5 else ())
     return mapper
 
 
@@ -67,8 +77,8 @@ def own_factors(mapper: FixedLagMapper) -> Sequence[gtsam.NonlinearFactor]:
 def mapper(request: pytest.FixtureRequest, log: Log) -> FixedLagMapper:
     """In lap 1 all active, in parts, with factors of the user's; after closing in parts, and all active."""
     cycles, case = request.param
-    far = FarSettings(stretch=1e4, room=1e4) if case.endswith("all") else EAGER
-    found = driven(log, cycles, MapperSettings(far=far, relinearize=EXACT), case == "factors")
+    far = (1e4, 1e4) if case.endswith("all") else EAGER
+    found = driven(log, cycles, MapperSettings(relinearize=EXACT), case == "factors", far)
     assert found.closed == case.startswith("closed")
     assert (len(found.road.smoother.inactive) > 0) == (not case.endswith("all"))
     return found
@@ -162,9 +172,7 @@ def test_it_can_be_printed_and_drawn(
 def test_it_shares_nothing_with_the_mapper(log: Log) -> None:
     """Its error at the old values is the same after the mapper has driven on."""
     pairs = list(split_odometry(log))
-    mapper = FixedLagMapper(MapperSettings(far=EAGER), log.odometry_sigma)
-    for odometry, cycle in pairs[:60]:
-        mapper.update(odometry, cycle)
+    mapper = driven(log, 60, MapperSettings())
     graph, values = mapper.graph(), mapper.values()
     before = graph.error(values)
     for odometry, cycle in pairs[60:80]:
@@ -174,7 +182,7 @@ def test_it_shares_nothing_with_the_mapper(log: Log) -> None:
 
 @pytest.mark.parametrize("degree", [2, 4])
 def test_it_is_the_mapper_s_system_for_other_degrees(log: Log, degree: int) -> None:
-    settings = MapperSettings(far=EAGER, spline=SplineSettings(degree=degree))
+    settings = MapperSettings(spline=SplineSettings(degree=degree))
     mapper = driven(log, 60, settings)
     assert {LEFT, RIGHT} == set(mapper.boundaries)
     hessian, _ = own_system(mapper)

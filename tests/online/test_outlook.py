@@ -63,7 +63,7 @@ def test_an_open_map_leads_on_through_all_cones_in_sight(mapper: FixedLagMapper)
 
 def test_a_track_is_as_uncertain_as_its_detections_and_the_curve_beside_it(mapper: FixedLagMapper) -> None:
     """Cones stand about 0.1 m from a smooth curve."""
-    tracks = mapper.road.growth.tentative[LEFT]
+    tracks = mapper.road.growth.tentative
     found = outlook(mapper)
     for place, variance in zip(found.tracks, found.variances, strict=True):
         (row,) = np.flatnonzero(np.hypot(*(tracks.points - place).T) < 1e-9)
@@ -152,7 +152,7 @@ def test_the_covariance_is_that_of_the_fit_by_differences(mapper: FixedLagMapper
     """The tracks move with the vehicle; their own errors and the bends are independent of everything."""
     found, state = outlook(mapper), mapper.road.smoother.map.state
     newest = pose_keys(np.array([mapper.road.smoother.next_cycle - 1]))
-    joint = mapper.road.smoother.covariance(np.concatenate([state.keys(LEFT), newest]))
+    joint = mapper.road.smoother.covariance(np.concatenate([state.control_keys(LEFT), newest]))
     assert found.placement is not None
     vehicle, tracks, bend = mapper.poses[-1], found.tracks, SIGMA_BEND
 

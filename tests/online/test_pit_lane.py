@@ -10,7 +10,7 @@ from pathspace_graph.loop.lost import FOUND
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.ahead import TrackAhead
+from pathspace_graph.spline.planning import TrackAhead
 
 from ..scenes.drives import Array, replay, true_poses
 from ..scenes.kidnapped import circuit_with_lane

@@ -18,6 +18,7 @@ def laid(
     seen: ConeArrays,
     known: ConeArrays,
     views: Array,
+    centres: Array,
     means: Array,
     prior: Array,
     reach: tuple[float, float],
@@ -25,11 +26,15 @@ def laid(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return the places where seen cones may lie, as `find` compares them.
 
-    Each mean is tried, as few cones may have been met again, and then the poses that may cost least.
+    Each centre is tried, as few cones may have been met again, and then the poses that may cost least.
     """
-    apart, places, means = limits[4], int(limits[5]), np.asarray(means)
-    votes = [(*one, mean) for mean in means for one in _starts(seen, known, mean, prior, reach, limits)]
-    starts = [(mean, mean) for mean in means]
+    apart, places, pairs = limits[4], int(limits[5]), [*zip(centres, means, strict=True)]
+    votes = [
+        (*one, mean)
+        for centre, mean in pairs
+        for one in _starts(seen, known, centre, mean, prior, reach, limits)
+    ]
+    starts = [*pairs]
     starts += [(start, mean) for _, start, mean in sorted(votes, key=lambda one: -one[0])]
     tried, found = list[Array](), []
     for start, mean in starts:
@@ -47,12 +52,13 @@ def laid(
 def _starts(
     seen: ConeArrays,
     known: ConeArrays,
+    centre: Array,
     mean: Array,
     prior: Array,
     reach: tuple[float, float],
     limits: tuple[float, ...],
 ) -> list[tuple[float, Array]]:
-    """Return scores and poses (3,) about a mean that may cost least.
+    """Return scores and poses (3,) about a centre that may cost least.
 
     Each pair of cones votes for a cell and the eight around it, against the distance from the mean.
     """
@@ -61,23 +67,25 @@ def _starts(
     half, turns = int(np.ceil(reach[0] / size)) + 1, int(np.ceil(reach[1] / step))
     starts = list[tuple[float, Array]]()
     for turn in range(-turns, turns + 1):
-        heading = mean[2] + turn * step
+        heading = centre[2] + turn * step
         c, s = np.cos(heading), np.sin(heading)
         x, y = seen[0][i].T
         move = np.column_stack([c * x - s * y, s * x + c * y])
-        cell = np.floor((known[0][j] - move - mean[:2]) / size + 0.5).astype(np.intp) + half
+        cell = np.floor((known[0][j] - move - centre[:2]) / size + 0.5).astype(np.intp) + half
         cell = cell[((cell > 0) & (cell < 2 * half)).all(axis=1)]
         votes = np.zeros((2 * half + 1, 2 * half + 1), np.intp)
         for a in (-1, 0, 1):
             for b in (-1, 0, 1):
                 np.add.at(votes, (cell[:, 0] + a, cell[:, 1] + b), 1)
         at = np.argwhere(votes)
-        off = np.column_stack([(at - half) * size, np.full(len(at), turn * step)])
+        poses = centre + np.column_stack([(at - half) * size, np.full(len(at), turn * step)])
+        off = poses - mean
+        off[:, 2] = wrap_angle(off[:, 2])
         score = gain * votes[at[:, 0], at[:, 1]] - np.minimum(
             np.einsum("ka,ab,kb->k", off, prior, off), failed
         )
         best = np.argsort(-score, kind="stable")[:places]
-        starts += zip(score[best].tolist(), mean + off[best], strict=True)
+        starts += zip(score[best].tolist(), poses[best], strict=True)
     return starts
 
 

@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, path_lengths
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.places.constellation import CURVE_SIGMA, LINE_WEIGHT, Constellation, Prior, SampledCurves
+from pathspace_graph.places.constellation import (
+    CURVE_SIGMA,
+    LINE_WEIGHT,
+    PATH_STEP,
+    Constellation,
+    Prior,
+    SampledCurves,
+)
 from pathspace_graph.places.find import (
     FITS_BY_CHANCE,
-    HYPOTHESES_APART,
     LEAST_CONES,
-    ROAD_STEP,
+    REACH,
     SURE_ODDS,
     KnownRoad,
     along,
     find,
+    sure,
 )
-from pathspace_graph.places.find import _spread as spread
 from pathspace_graph.spline.bspline import BSpline
 
 SIDES = {LEFT: 2.0, RIGHT: -2.0}
@@ -76,8 +83,8 @@ def seen_from(dents: tuple[float, float], poses: Array) -> Constellation:
 def test_a_vehicle_is_found_anywhere(begin: float, has_cones: bool) -> None:
     poses = driven(PEAR, begin, begin + 2.4)
     known = road(PEAR, has_cones)
-    place = find(seen_from(PEAR, poses), known.seen, known.along(compose(inverse(MOTION), poses)))[0]
-    assert place.odds >= SURE_ODDS
+    place = find(seen_from(PEAR, poses), known.seen, known.along(compose(inverse(MOTION), poses)))
+    assert place is not None and place.odds >= SURE_ODDS
     np.testing.assert_allclose(place.pose[:2], poses[-1, :2], atol=0.05)
     np.testing.assert_allclose(np.sin(place.pose[2] - poses[-1, 2]), 0.0, atol=0.01)
 
@@ -87,8 +94,7 @@ def test_on_another_road_it_is_nowhere(has_cones: bool) -> None:
     known = road(OTHER, has_cones)
     for begin in np.arange(0.0, 6.0, 0.5):
         poses = driven(PEAR, begin, begin + 2.4)
-        places = find(seen_from(PEAR, poses), known.seen, known.along(poses))
-        assert not places or places[0].odds < SURE_ODDS
+        assert sure(find(seen_from(PEAR, poses), known.seen, known.along(poses))) is None
 
 
 @pytest.mark.parametrize("has_cones", [True, False])
@@ -96,9 +102,10 @@ def test_of_two_places_that_look_alike_none_is_sure(has_cones: bool) -> None:
     """After half a turn the oval is the same, but for its cones."""
     poses = driven(OVAL, 0.5, 2.9)
     known = road(OVAL, False)
-    places = find(seen_from(OVAL, poses), known.seen, known.along(poses))
-    assert places[0].odds == pytest.approx(0.0, abs=1.0)
-    np.testing.assert_allclose(places[1].pose[:2], -places[0].pose[:2], atol=0.2)
+    place = find(seen_from(OVAL, poses), known.seen, known.along(poses))
+    assert place is not None and place.odds == pytest.approx(0.0, abs=1.0)
+    away = [np.hypot(*(place.pose - sign * poses[-1])[:2]) for sign in (1.0, -1.0)]
+    assert min(away) < 0.2
 
 
 def test_the_more_places_are_tried_the_more_fit_by_chance() -> None:
@@ -107,10 +114,11 @@ def test_the_more_places_are_tried_the_more_fit_by_chance() -> None:
     known, seen = road(PEAR, True), seen_from(PEAR, poses)
     few = Constellation(*(column[:8] for column in seen.cones))
     elsewhere = poses[-1] + np.column_stack([500.0 * np.arange(10), np.zeros((10, 2))])
-    odds = [
-        find(few, known.seen, Prior.about(tried, (3.0, 3.0, 0.2), (1.0, 0.1), failed=0.0))[0].odds
-        for tried in (poses[-1], elsewhere)
-    ]
+    odds = []
+    for tried in (poses[-1], elsewhere):
+        place = find(few, known.seen, Prior.about(tried, (3.0, 3.0, 0.2), (1.0, 0.1), failed=0.0))
+        assert place is not None
+        odds.append(place.odds)
     assert odds[0] == pytest.approx(8.0 * np.log(1.0 / FITS_BY_CHANCE), abs=0.01)
     assert odds[0] - odds[1] == pytest.approx(np.log(10.0), abs=0.01)
 
@@ -119,9 +127,9 @@ def test_backwards_left_is_right() -> None:
     poses = driven(PEAR, 1.0, 3.4)
     seen, own = seen_from(PEAR, poses), compose(inverse(MOTION), poses)
     turned = road(PEAR, True).backwards()
-    assert all(place.odds < SURE_ODDS for place in find(seen, turned.seen, turned.along(own)))
+    assert sure(find(seen, turned.seen, turned.along(own))) is None
     forwards = turned.backwards()
-    assert find(seen, forwards.seen, forwards.along(own))[0].odds >= SURE_ODDS
+    assert sure(find(seen, forwards.seen, forwards.along(own))) is not None
 
 
 # --- hypotheses --------------------------------------------------------------------------------------------
@@ -130,12 +138,12 @@ def test_backwards_left_is_right() -> None:
 def test_a_path_is_laid_where_it_belongs() -> None:
     """A part of a loop is found at its place, the best first, and the others are apart."""
     way = road(PEAR, False).way
-    assert np.abs(np.diff(path_lengths(way)) - ROAD_STEP).max() < 0.1
+    assert np.abs(np.diff(path_lengths(way)) - PATH_STEP).max() < 0.1
     poses = driven(PEAR, 4.0, 7.0)
     found = along(compose(inverse(MOTION), poses), way, True)
     np.testing.assert_allclose(found[0][:2], poses[-1, :2], atol=1.0)
     np.testing.assert_allclose(np.sin(found[0][2] - poses[-1, 2]), 0.0, atol=0.05)
-    assert len(found) < 2 or pdist(found[:, :2]).min() > 0.5 * HYPOTHESES_APART
+    assert len(found) < 2 or pdist(found[:, :2]).min() > 0.5 * REACH[0]
 
 
 def test_on_an_open_road_a_path_is_inside() -> None:
@@ -193,11 +201,44 @@ def test_a_few_points_have_no_place() -> None:
     poses = driven(PEAR, 1.0, 3.0)
     seen = seen_from(PEAR, poses)
     few = Constellation(*(column[: LEAST_CONES - 1] for column in seen.cones))
-    assert find(few, known.seen, known.along(poses)) == []
+    assert find(few, known.seen, known.along(poses)) is None
+
+
+def circle(count: int) -> Array:
+    """Return the way (n, 2) around a circle, on which a path fits everywhere."""
+    phi = 2.0 * np.pi * np.arange(count) / count
+    return 0.5 * PATH_STEP / np.sin(np.pi / count) * np.column_stack([np.cos(phi), np.sin(phi)])
 
 
 def test_hypotheses_are_spread_over_the_seam_of_a_closed_way() -> None:
     """The last and the first point of a ring are neighbours; on an open road they are its ends."""
-    ends, order = np.array([0, 99]), [0, 1]
-    assert spread(ends, 100, order) == [0]
-    assert spread(ends, None, order) == [0, 1]
+    way = circle(20)
+    heading = np.arctan2(*np.roll(way, -1, axis=0).T[::-1] - way.T[::-1])
+    poses = np.column_stack([way, np.unwrap(heading)])[3:9]
+    around, between = (nearest(way, along(poses, way, closed)) for closed in (True, False))
+    assert (np.diff([*around, around[0] + 20]) >= 3).all()
+    assert (np.diff(between) >= 3).all()
+    assert between.min() >= 5, "a path of five steps does not end before the fifth"
+
+
+def nearest(way: Array, poses: Array) -> Array:
+    """Return the indices of the points of a way beside poses (k, 3), ascending."""
+    return np.sort(KDTree(way).query(poses[:, :2])[1])
+
+
+def test_a_path_is_aligned_by_the_least_squares_of_its_points() -> None:
+    """Of all stretches, by singular values (Umeyama 1991)."""
+    rng, way = np.random.default_rng(0), road(PEAR, False).way
+    points = way[10:22] + 0.1 * rng.normal(size=(12, 2))
+    length = path_lengths(points)
+    at = length[-1] - PATH_STEP * np.arange(int(length[-1] / PATH_STEP), -1, -1)
+    path = np.column_stack([np.interp(at, length, axis) for axis in points.T])
+    fits = []
+    for end in range(len(way)):
+        target = way[np.arange(end - len(path) + 1, end + 1) % len(way)]
+        left, _, right = np.linalg.svd((target - target.mean(axis=0)).T @ (path - path.mean(axis=0)))
+        turn = left @ np.diag([1.0, np.linalg.det(left @ right)]) @ right
+        misfit = target - target.mean(axis=0) - (path - path.mean(axis=0)) @ turn.T
+        fits.append(((misfit**2).sum(), *turn @ (points[-1] - path.mean(axis=0)) + target.mean(axis=0)))
+    found = along(np.column_stack([points, np.zeros(12)]), way, True)
+    np.testing.assert_allclose(found[0][:2], min(fits)[1:], atol=1e-9)

@@ -62,8 +62,7 @@ def searches() -> Array:
             constellation = Constellation(seen, variances, labels[near])
             own = compose(inverse(true[0]), true)
             for is_right, on in ((True, road), (False, known((seed + 1) % TRACKS)[0])):
-                places = find(constellation, on.seen, on.along(own))
-                best = places[0] if places else None
+                best = find(constellation, on.seen, on.along(own))
                 off = np.inf if best is None else float(np.hypot(*relative(true[-1], best.pose)[:2]))
                 found.append((-np.inf if best is None else best.odds, is_right, off))
     return np.array(found)

@@ -15,19 +15,17 @@ from pathspace_graph.factors.se2 import compose, left_of, path_lengths, relative
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.detections import DetectionColumns
-from pathspace_graph.mapping.tentative import TentativeTracks, merged_in_turn
 from pathspace_graph.places.constellation import (
-    CONE_SIGHTINGS,
     FAILED,
     FIT_SIGMA,
     MERGE_RANGE,
-    VIEWS,
+    PATH_STEP,
     Constellation,
     Prior,
 )
 from pathspace_graph.places.find import FITS_BY_CHANCE, LEAST_CONES, SURE_ODDS, Place, find
 from pathspace_graph.places.passes import (
-    NEARBY,
+    CLOSES_WITHIN,
     SeenIn,
     find_return,
     return_to_beginning,
@@ -76,7 +74,9 @@ def best(
     seen: Constellation, known: Constellation, mean: Array, information: Array, reach: tuple[float, float]
 ) -> Place:
     """Return the best place about a pose."""
-    return find(seen, known, Prior(mean[None], information, reach))[0]
+    place = find(seen, known, Prior(mean[None], information, reach))
+    assert place is not None
+    return place
 
 
 def is_sure(place: Place) -> bool:
@@ -173,6 +173,7 @@ def test_the_compiled_places_are_those_in_numpy(seed: int) -> None:
         (points + pose[:2], 0.01 * spread(2, 17), labels),
         views,
         pose + np.array([[0.7, -0.4, 0.1], [-3.0, 1.0, 0.0]]),
+        pose + np.array([[0.7, 0.8, 2.0 * np.pi], [-2.0, 1.0, 0.0]]),
         0.1 * (spread(3)[0] + np.eye(3)),
         REACH,
         (0.25, 9.0, 0.5, 0.05, 1.0, 10.0, 2.0, 20.0),
@@ -252,38 +253,23 @@ def test_a_vehicle_that_is_not_back_yet_fits_a_gap_farther_along_a_row() -> None
 def test_a_few_cones_have_no_sure_place(seen: int, known: int) -> None:
     cones = scattered()
     prior = Prior(POSE[None], NOTHING, REACH)
-    places = find(beside(cones, slice(seen)), beside(cones, slice(known), np.zeros(3)), prior)
-    assert all(place.odds == -np.inf for place in places)
+    place = find(beside(cones, slice(seen)), beside(cones, slice(known), np.zeros(3)), prior)
+    assert place is None or place.odds == -np.inf
 
 
 # --- cones of detections ---------------------------------------------------------------------------------
 
 
-def test_detections_are_merged_in_turn_as_tracks_are() -> None:
-    rng = np.random.default_rng(4)
-    points = np.repeat(rng.uniform(-9.0, 9.0, (15, 2)), 8, axis=0) + 0.3 * rng.normal(size=(120, 2))
-    roots = rng.normal(size=(120, 2, 2))
-    covariances = 0.02 * np.eye(2) + 0.1 * roots @ roots.transpose(0, 2, 1)
-    tracks = TentativeTracks(GROWTH)
-    for k in range(120):
-        tracks.add(points[k : k + 1], covariances[k : k + 1], 0.0)
-    found, information, counts = merged_in_turn(points, covariances, GROWTH)
-    assert 15 <= len(found) < 60
-    np.testing.assert_allclose(found, tracks.points, atol=1e-12)
-    np.testing.assert_allclose(information, tracks.information, rtol=1e-12)
-    np.testing.assert_array_equal(counts, tracks.counts)
-
-
 def test_cones_are_seen_often_enough_near_enough_and_in_colour() -> None:
     """Each of four cones but the first lacks one of these."""
     near, far = [5.0, 1.0], [MERGE_RANGE + 1.0, 0.0]
-    rows = [(near, LEFT)] * CONE_SIGHTINGS + [([5.0, -3.0], LEFT)] * (CONE_SIGHTINGS - 1)
-    rows += [(far, LEFT)] * CONE_SIGHTINGS + [([1.0, 4.0], UNKNOWN)] * CONE_SIGHTINGS
+    rows = [(near, LEFT)] * GROWTH.sightings + [([5.0, -3.0], LEFT)] * (GROWTH.sightings - 1)
+    rows += [(far, LEFT)] * GROWTH.sightings + [([1.0, 4.0], UNKNOWN)] * GROWTH.sightings
     points, labels = np.array([point for point, _ in rows]), np.array([label for _, label in rows])
     seen = Detections(0.0, points, np.tile(0.03 * np.eye(2), (len(rows), 1, 1)), labels)
     found = Constellation.of(DetectionColumns.of([seen]), POSE[None], GROWTH)
     np.testing.assert_allclose(found.points, to_map(np.array([near]), POSE[None]))
-    np.testing.assert_allclose(found.covariances, [0.03 / CONE_SIGHTINGS * np.eye(2)], atol=1e-12)
+    np.testing.assert_allclose(found.covariances, [0.03 / GROWTH.sightings * np.eye(2)], atol=1e-12)
     np.testing.assert_array_equal(found.labels, [LEFT])
 
 
@@ -293,7 +279,7 @@ def test_the_views_are_those_of_nearly_all_detections() -> None:
     bearing[:2], distance[-2:] = 1.5, 15.0
     points = distance[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
     seen = Detections(0.0, points, np.tile(0.03 * np.eye(2), (40, 1, 1)), np.full(40, LEFT))
-    poses = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [VIEWS + 0.1, 0.0, 0.0]])
+    poses = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [PATH_STEP + 0.1, 0.0, 0.0]])
     found = Constellation.of(DetectionColumns.of([seen, seen, seen]), poses, GROWTH)
     np.testing.assert_allclose(found.views[:, :3], poses[[0, 2]])
     assert (found.views[:, 3] < 15.0).all() and (found.views[:, 3] >= 10.0).all()
@@ -354,9 +340,34 @@ def test_a_round_of_a_skidpad_is_no_lap() -> None:
     """Its cones are met again as surely, but the newest path does not cross the start."""
     true = along(ENTRY, ON_ROUND, (10.0, -1.0 / 12.0))
     poses, seen_in = drifted(true), sensor(true)
-    found = find_return(seen_in, poses, 40.0, Prior.about(poses[-1], *NEARBY), SETTINGS)
+    found = find_return(seen_in, poses, 40.0, SETTINGS)
     assert found is not None
     assert return_to_beginning(seen_in, poses, UNCERTAIN, SETTINGS) is None
+
+
+KILOMETRE = (1000.0, 2.0 * np.pi / 1000.0)
+FAR = np.array([60.0, -80.0, 0.25])  # drift of the second half of a kilometre
+
+
+@pytest.mark.parametrize(("sigma", "is_found"), [(60.0, True), (10.0, False)])
+def test_a_return_is_searched_wherever_the_drift_allows_it(sigma: float, is_found: bool) -> None:
+    """The newest pose is a hundred metres off the beginning, which its covariance allows, or not."""
+    true = along(KILOMETRE, (40.0, KILOMETRE[1]))
+    poses = np.concatenate([true[:1000], compose(FAR, true[1000:])])
+    covariance = np.diag([sigma**2, sigma**2, 0.04])
+    revisit = return_to_beginning(sensor(true), poses, covariance, SETTINGS)
+    assert (revisit is not None) is is_found
+    if revisit is not None:
+        np.testing.assert_allclose(revisit.local, relative(true[revisit.earlier], true[-1]), atol=1.0)
+
+
+@pytest.mark.parametrize(("beyond", "is_found"), [(CLOSES_WITHIN - 10.0, True), (CLOSES_WITHIN + 6.0, False)])
+def test_a_lap_closes_on_the_beginning_alone(beyond: float, is_found: bool) -> None:
+    """Farther on, the right place may not be among those that are tried."""
+    true = along(KILOMETRE, (beyond, KILOMETRE[1]))
+    poses = true + np.linspace(0.0, 1.0, len(true))[:, None] * DRIFT
+    revisit = return_to_beginning(sensor(true), poses, UNCERTAIN, SETTINGS)
+    assert (revisit is not None) is is_found
 
 
 def test_an_open_road_meets_no_cones_again() -> None:
@@ -370,9 +381,7 @@ def test_another_road_beside_is_no_return(lane: float, is_same: bool) -> None:
     first = along((40.0, 0.0))
     elsewhere, beside_it = np.array([80.0, 40.0, 0.0]), np.array([0.0, lane, 0.0])
     true = np.concatenate([first, along((6.0, 0.0)) + elsewhere, first[10:60] + beside_it])
-    found = find_return(
-        sensor(true), true, float(path_lengths(first)[-1]), Prior.about(true[-1], *NEARBY), SETTINGS
-    )
+    found = find_return(sensor(true), true, float(path_lengths(first)[-1]), SETTINGS)
     assert (found is not None) is is_same
     if found is not None:
         np.testing.assert_allclose(found[0].pose, true[-1], atol=0.1)

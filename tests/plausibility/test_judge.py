@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 
-from pathspace_graph import hints
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
+from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.io.overrides import override
-from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.plausibility.judge import positions_in_metres
+from pathspace_graph.labels import KINDS, LEFT, RIGHT, UNKNOWN, Kind
+from pathspace_graph.plausibility.judge import hints, is_line, objections, positions_in_metres
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import preset, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
@@ -122,12 +125,6 @@ def test_the_place_of_a_sensor_is_told() -> None:
     assert found.cause == "mounting"
     words = found.advice.split()
     assert [float(words[1]), float(words[5].strip(","))] == pytest.approx([2.5, -1.0], abs=0.4)
-
-
-def test_advice_for_quarter_turns_undoes_them() -> None:
-    (found,) = hints(MISTAKES["sensor frame: x to the right, y ahead"](short_drive()))
-    assert found.likely == "the sensor's frame has x to the right and y ahead"
-    assert found.advice == "put y into column x and -x into column y"
 
 
 def test_two_mistakes_are_both_told() -> None:
@@ -314,3 +311,133 @@ def test_two_cameras_that_disagree_in_time_are_no_sensor_of_lines() -> None:
     (found,) = hints(log)
     assert found.cause == "sides"
     assert 35.0 < float(found.likely.split("by ")[1].split(" ms")[0]) < 65.0
+
+
+# --- noise that is stated --------------------------------------------------------------------------------
+
+
+def with_covariances(log: Log, factor: float) -> Log:
+    cycles = [replace(cycle, covariances=factor**2 * cycle.covariances) for cycle in log.cycles]
+    return replace(log, cycles=tuple(cycles))
+
+
+@pytest.mark.parametrize(
+    ("factor", "size", "which"), [(0.4, "small", ("vx", "vy", "wz")), (4.0, "large", ("vx", "wz"))]
+)
+def test_stated_noise_of_odometry_is_contradicted(factor: float, size: str, which: tuple[str, ...]) -> None:
+    """A lateral velocity that is stated four times too large may stand for the drift that is assumed."""
+    log = short_drive()
+    (found,) = hints(replace(log, odometry_sigma=factor * log.odometry_sigma))
+    assert (found.cause, found.file) == ("noise", "log.toml")
+    assert f"the stated noise is too {size}" in found.likely
+    assert tuple(part.split()[0] for part in found.found.split(", ") if "scatters by" in part) == which
+    assert found.advice.startswith("--noise measured")
+
+
+@pytest.mark.parametrize(("factor", "size"), [(0.3, "small"), (4.0, "large")])
+def test_stated_covariances_are_contradicted(factor: float, size: str) -> None:
+    found = hints(with_covariances(short_drive(), factor))
+    assert [(hint.cause, hint.likely) for hint in found] == [("noise", f"the covariances are too {size}")]
+
+
+def test_noise_that_nobody_has_stated_is_not_contradicted() -> None:
+    log = with_covariances(short_drive(), 4.0)
+    unstated = replace(
+        log, odometry_sigma=0.1 * log.odometry_sigma, odometry_stated=False, detections_stated=False
+    )
+    assert hints(unstated) == []
+
+
+def test_rough_motion_does_not_count_as_noise() -> None:
+    t = 0.1 * np.arange(300)
+    twists = np.column_stack([5.0 + np.sin(2.0 * t), 0.0 * t, 0.3 * np.cos(3.0 * t)])
+    log = replace(short_drive(), odometry=Odometry(t, twists), odometry_sigma=np.full(3, 1e-4))
+    record = TwistRecord()
+    record.add(log.odometry)
+    orders = record.orders()
+    assert orders is not None
+    assert (orders[:, 0].max() > 2.0 * orders[:, 0].min()) and orders[:, 0].min() > 1.5e-4
+    assert not any(hint.cause == "noise" and hint.file == "log.toml" for hint in hints(log))
+
+
+# --- cones, or points of lines ---------------------------------------------------------------------------
+
+
+SPEED, PERIOD, SIGMA = 10.0, 0.1, 0.05
+Row = Callable[[int, float], np.ndarray]  # x (k,) of a row's points, vehicle frame, in a cycle at x (m)
+
+
+def cones(cycle: int, x: float) -> np.ndarray:
+    """Cones 4 m apart on the way, as they are seen ahead."""
+    ahead = np.arange(0.0, 400.0, 4.0) - x
+    return ahead[(ahead > 0.0) & (ahead < 20.0)]
+
+
+def line(cycle: int, x: float) -> np.ndarray:
+    """Points 4 m apart whose phase is another one in each cycle."""
+    return np.mod(1.7 * cycle**2, 4.0) + np.arange(0.0, 20.0, 4.0)
+
+
+def beams(cycle: int, x: float) -> np.ndarray:
+    """Points of a wall at fixed places of the vehicle's frame."""
+    return np.arange(1.0, 21.0, 3.7)
+
+
+def drive(left: Row, right: Row, speed: float = SPEED, across: float = 0.0) -> Log:
+    """A straight drive between two rows, whose points are off them by up to `across` (m)."""
+    rng, cycles = np.random.default_rng(0), []
+    for cycle in range(250):
+        x = speed * PERIOD * cycle
+        rows = [(row(cycle, x), side) for row, side in ((left, 2.0), (right, -2.0))]
+        points = np.concatenate([np.column_stack([own, np.full(len(own), side)]) for own, side in rows])
+        points[:, 1] += across * rng.uniform(-1.0, 1.0, len(points))
+        labels = np.repeat([LEFT, RIGHT], [len(own) for own, _ in rows])
+        covariances = np.tile(SIGMA**2 * np.eye(2), (len(points), 1, 1))
+        cycles.append(Detections(cycle * PERIOD, points, covariances, labels))
+    t = PERIOD * np.arange(250)
+    odometry = Odometry(t, np.tile([speed, 0.0, 0.0], (250, 1)))
+    return Log(odometry, tuple(cycles), np.full(3, SIGMA))
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "told"),
+    [(cones, cones, False), (line, line, True), (beams, beams, True)],
+)
+def test_points_that_stay_are_cones(left: Row, right: Row, told: bool | None) -> None:
+    assert is_line(drive(left, right)) is told
+
+
+def test_at_rest_nothing_is_told() -> None:
+    assert is_line(drive(beams, beams, speed=0.0)) is None
+
+
+def test_points_that_lie_on_no_line_are_none_of_a_line() -> None:
+    assert is_line(drive(line, line, across=1.0)) is None
+
+
+@pytest.mark.parametrize("spacing", [0.25, 1.0, 4.0])
+def test_a_drive_along_lines_of_any_spacing_is_told(spacing: float) -> None:
+    assert is_line(line_drive(1, spacing))
+
+
+def test_a_setting_comes_before_the_log_and_cones_are_the_default() -> None:
+    known = {
+        (setting, stated): MapperSettings(kind=setting).with_kind(stated)
+        for setting, stated in product((None, *KINDS), repeat=2)
+    }
+    assert all(one.kind == (setting or stated or "cones") for (setting, stated), one in known.items())
+    assert all(one.stations != one.of_lines for one in known.values())
+
+
+@pytest.mark.parametrize(("stated", "told"), [(None, True), ("cones", True), ("line", False)])
+def test_lines_that_are_not_said_to_be_some_get_a_hint(stated: Kind | None, told: bool) -> None:
+    log = replace(line_drive(1, 1.0), sensor=SensorInfo(kind=stated))
+    found = [hint for hint in hints(log) if hint.cause == "kind"]
+    assert [hint.advice for hint in found] == ['state kind = "line", or map with --kind line'] * told
+    assert bool(objections(found)) is told
+
+
+@pytest.mark.parametrize(("stated", "told"), [(None, False), ("cones", False), ("line", True)])
+def test_cones_that_are_said_to_be_lines_get_a_hint(stated: Kind | None, told: bool) -> None:
+    log = replace(short_drive(), sensor=SensorInfo(kind=stated))
+    assert ["kind" in hint.cause for hint in hints(log)] == [True] * told

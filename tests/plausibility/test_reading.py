@@ -26,12 +26,6 @@ def written(log: Log, folder: Path) -> Path:
     return folder
 
 
-def test_a_good_log_is_read_without_hints(tmp_path: Path) -> None:
-    log, found = read_plausible_log(written(short_drive(), tmp_path / "log"), LimitSettings())
-    assert found == []
-    np.testing.assert_array_equal(log.odometry.twist, short_drive().odometry.twist)
-
-
 @pytest.mark.parametrize(
     ("mistake", "file", "likely"),
     [

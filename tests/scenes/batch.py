@@ -16,6 +16,7 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
+from pathspace_graph.graph.elimination import solution
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
@@ -55,7 +56,7 @@ def straight(
         DetectionTable.of(log.cycles),
     )
     detections.twist[:] = ahead(6.0, 1.0)[0]
-    system = BatchSystem(detections, chain, settings)
+    system = BatchSystem(detections, [chain], [settings])
     system.kernel = Biweight(LEAST_SQUARES)
     state = start_odometry(system)
     system.begin(state)
@@ -70,14 +71,13 @@ def settled(system: BatchSystem, state: State, steps: int = 4) -> State:
     for _ in range(steps):
         at = system.evaluate(state)
         system.detections.refine(at.across.rows, at.u)
-        problem = system.eliminated(at)
-        state = moved(state, problem.step(np.zeros(problem.map.size)))
+        state = moved(state, solution(system.linear_graph(at), state.variables.layout))
     return state
 
 
 def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, Array]:
     """Returns the same drive measured with the problem's own noise, and the calibration (7,) in it."""
-    detections, chain = system.detections, system.chain
+    detections, chain = system.detections, system.chains[0]
     odometry = system.settings.odometry
     sigmas = [odometry.sigma_scale, odometry.sigma_bias, *system.settings.calibration.sigmas]
     calibration = rng.normal(0.0, sigmas)
@@ -87,8 +87,8 @@ def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, A
     points += sigma[:, None] * rng.normal(size=points.shape)
     noisy = BatchSystem(
         replace(detections, measured=points, u=detections.u.copy()),
-        drawn_chain(chain, calibration[:2], rng),
-        system.settings,
+        [drawn_chain(chain, calibration[:2], rng)],
+        system.priors,
     )
     noisy.kernel = system.kernel
     return noisy, calibration
@@ -115,7 +115,7 @@ def state_of(curves: dict[int, Array], poses: Array, periodic: bool = False) -> 
     """Returns a state with a curve through ordered points (k, 2) for each label, and poses (P, 3)."""
     settings, state = MapperSettings(), State()
     for label, points in curves.items():
-        spline = fit_spline(points, len(points) // 2, periodic)
+        spline, _ = fit_spline(points, len(points) // 2, periodic)
         state.add_boundary(label, *boundary_of(spline, settings))
     add_drive(state, poses, np.zeros(2))
     return state

@@ -9,10 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from pathspace_graph.io.log import Odometry
-from pathspace_graph.sim.curves import ring
-from pathspace_graph.sim.lines import as_lines
-from pathspace_graph.sim.sensor import OdometryNoise, measure_twists
-from pathspace_graph.sim.track import to_map_frame
+from pathspace_graph.sim.sensor import OdometryNoise, as_lines, measure_twists
+from pathspace_graph.sim.track import ring, to_map_frame
 from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.sim.vehicle import VehicleSettings, drive
 

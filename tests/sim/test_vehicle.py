@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
@@ -11,9 +9,9 @@ from scipy.linalg import expm
 from scipy.spatial import cKDTree
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.laps import lap_end_indices
-from pathspace_graph.sim.curves import SmoothCurve, left_normals
-from pathspace_graph.sim.track import Track, to_map_frame
+from pathspace_graph.sim.track import SmoothCurve, Track, to_map_frame
 from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.sim.vehicle import Drive, VehicleSettings, _settling, _wander, drive, integrate
 
@@ -143,11 +141,11 @@ def test_a_start_beside_a_bend_begins_in_its_own_direction() -> None:
     circle = 10.0 * np.column_stack([np.cos(at / 10.0), np.sin(at / 10.0)])
     circle[-1] = circle[0]
     line = SmoothCurve(CubicSpline(at, circle, bc_type="periodic"), at[-1], True, np.full(401, 2.0))
-    pose = line.points(np.array([0.0]))[0] + 2.0 * left_normals(line.tangents(np.array([0.0])))[0]
+    pose = line.points(np.array([0.0]))[0] + 2.0 * left_of(line.tangents(np.array([0.0])))[0]
     heading = np.arctan2(*line.tangents(np.array([0.0]))[0][::-1]) + 0.3
     s = np.array([0.0, 1e-4])
     offset = _settling(line, 0.0, np.append(pose, heading), s, VehicleSettings())
-    path = line.points(s) + left_normals(line.tangents(s)) * offset[:, None]
+    path = line.points(s) + left_of(line.tangents(s)) * offset[:, None]
     assert np.arctan2(*np.diff(path, axis=0)[0][::-1]) == pytest.approx(heading, abs=1e-3)
 
 
@@ -166,17 +164,3 @@ def test_the_wander_begins_in_the_middle() -> None:
     least, near, far = np.abs(offsets).max(axis=0)
     assert least == 0.0 and near < 0.003
     assert 0.2 < far < 0.3
-
-
-def test_start_speed() -> None:
-    d = drive(generated(0), 1, VehicleSettings(speed_start=4.0), np.random.default_rng(0))
-    assert d.twists[0, 0] == pytest.approx(4.0, abs=0.1)
-
-
-@pytest.mark.parametrize(
-    "name", ["speed_max", "acceleration_lateral", "acceleration", "deceleration", "rate", "settle_distance"]
-)
-def test_bad_settings(name: str) -> None:
-    for value in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(SettingsError, match=name):
-            replace(VehicleSettings(), **{name: value})

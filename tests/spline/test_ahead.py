@@ -12,8 +12,8 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import split_odometry
-from pathspace_graph.spline.ahead import CurveAhead, check_line, track_ahead
 from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.planning import CurveAhead, check_line, track_ahead
 
 from ..scenes.drives import noisy_lap
 
@@ -69,9 +69,10 @@ def test_it_ends_where_the_map_ends() -> None:
 
 
 def test_beyond_the_end_of_the_map_there_is_nothing() -> None:
-    ahead = track_ahead(straights(beside=31.0), np.array([40.0, 0.0, 0.0]), 10.0, 1.0)
-    assert ahead.length == 0.0
-    assert len(ahead.left) == 0
+    for x in (31.0, 40.0):
+        ahead = track_ahead(straights(beside=x), np.array([40.0, 0.0, 0.0]), 10.0, 1.0)
+        assert ahead.length == 0.0
+        assert len(ahead.left) == 0
 
 
 def test_the_widths_are_along_the_normal_where_the_boundaries_diverge() -> None:
@@ -112,6 +113,29 @@ def test_a_turn_across_the_seam(turn: float) -> None:
     assert ahead.confirmed.all()
 
 
+def test_a_hairpin_is_followed_to_the_way_back() -> None:
+    """The road turns at a radius of 4 m, and comes back 8 m beside itself: 3 m from edge to edge."""
+    curves = {}
+    for label, radius in ((LEFT, 1.5), (RIGHT, 6.5)):
+        x = np.linspace(-30.0, 0.0, 61)[:-1]
+        angle = np.linspace(-np.pi / 2, np.pi / 2, 41)
+        there = np.column_stack([x, np.full(60, -radius)])
+        turn = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+        points = np.concatenate([there, turn, there[::-1] * [1.0, -1.0]])
+        u = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+        slopes = np.gradient(points, u, axis=0)
+        spline = BSpline.hermite(u, points, slopes / np.linalg.norm(slopes, axis=1)[:, None])
+        curves[label] = CurveAhead(spline.tables, spline.control_points, 20.0)
+    ahead = track_ahead(curves, np.array([-10.0, -4.0, 0.0]), 40.0, 1.0)
+    assert len(ahead.points) == 41
+    away = np.hypot(*(ahead.points - [10.0, 4.0]).T)
+    back = ahead.points[:, 0] < 10.0
+    np.testing.assert_allclose(away[~back], 4.0, atol=0.02)
+    np.testing.assert_allclose(np.abs(ahead.points[back, 1] - 4.0), 4.0, atol=0.02)
+    np.testing.assert_allclose(ahead.width_left, 2.5, atol=0.02)
+    np.testing.assert_allclose(ahead.width_right, 2.5, atol=0.02)
+
+
 def test_a_loop_is_given_at_most_once() -> None:
     curves = {
         label: CurveAhead(ring(r).tables, ring(r).control_points, 0.0)
@@ -149,7 +173,7 @@ def test_lengths_out_of_range_are_refused(distance: float, step: float, message:
 
 
 def test_a_drive_sees_its_centre_line_and_is_not_changed_by_looking() -> None:
-    """In each tenth cycle the line is that of the whole outline, on the open map and on the closed one."""
+    """In each fifth cycle the line is that of the whole outline, on the open map and on the closed one."""
     log = noisy_lap()
     looked = FixedLagMapper(odometry_sigma=log.odometry_sigma)
     compared = {False: 0, True: 0}
@@ -159,7 +183,7 @@ def test_a_drive_sees_its_centre_line_and_is_not_changed_by_looking() -> None:
         before = looked.road.smoother.variables.values.copy()
         ahead = looked.ahead(15.0)
         assert np.array_equal(looked.road.smoother.variables.values, before)
-        if cycle % 10 or len(ahead.points) < 2:
+        if cycle % 5 or len(ahead.points) < 2:
             continue
         pose = np.tile(looked.poses[-1], (len(ahead.points), 1))
         line = looked.outline().centre_line(0.1)

@@ -7,7 +7,7 @@ import pytest
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.spline.boundary import at_level_crossing, boundaries_cross, crossings, sampled
+from pathspace_graph.spline.boundary import at_level_crossing, boundaries_cross, polyline_crossings, sampled
 from pathspace_graph.spline.bspline import BSpline
 
 STEP = 0.25
@@ -32,17 +32,17 @@ def test_two_rings_cross_where_neither_holds_the_other(centre: float, crosses: b
 
 def test_segments_cross_where_both_are() -> None:
     level = np.column_stack([np.arange(10.0), np.zeros(10)])
-    found = crossings(level, np.array([[4.3, -1.0], [4.6, 2.0]]))
+    found = polyline_crossings(level, np.array([[4.3, -1.0], [4.6, 2.0]]))
     np.testing.assert_allclose(found, [[4.4, 0.0]], atol=1e-12)
-    assert len(crossings(level, np.array([[4.3, 0.1], [4.6, 1.0]]))) == 0
-    assert len(crossings(level, np.array([[9.3, -1.0], [9.6, 1.0]]))) == 0
+    assert len(polyline_crossings(level, np.array([[4.3, 0.1], [4.6, 1.0]]))) == 0
+    assert len(polyline_crossings(level, np.array([[9.3, -1.0], [9.6, 1.0]]))) == 0
 
 
 @pytest.mark.parametrize(("angle", "counts"), [(np.pi / 3.0, True), (np.pi / 6.0, False)])
 def test_only_steep_crossings_count(angle: float, counts: bool) -> None:
     level = np.column_stack([np.arange(10.0), np.zeros(10)])
     steep = np.array([4.5, 0.0]) + np.outer([-2.0, 2.0], [np.cos(angle), np.sin(angle)])
-    assert len(crossings(level, steep, 0.7)) == int(counts)
+    assert len(polyline_crossings(level, steep, 0.7)) == int(counts)
 
 
 def eight(side: float) -> tuple[BSpline, Array]:

@@ -10,7 +10,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.centre_line import SIDE, CentreCurve, find_line
+from pathspace_graph.spline.centre_line import CentreCurve, find_line
 
 from ..scenes.jacobians import assert_jacobians
 from ..scenes.maps import open_map, ring_map
@@ -37,8 +37,7 @@ def test_the_ribbon_between_two_circles() -> None:
     np.testing.assert_allclose(np.hypot(*ribbon.centre.evaluate(u).T), 20.0, atol=2e-3)
     np.testing.assert_allclose(ribbon.half_width(u), 2.0, atol=1e-3)
     for label, radius in ((LEFT, 18.0), (RIGHT, 22.0)):
-        np.testing.assert_allclose(np.hypot(*ribbon.edge(u, SIDE[label])[0].T), radius, atol=3e-3)
-        spline, _ = ribbon.edge_spline(label)
+        spline, _ = ribbon.edge(label)
         at = np.linspace(*spline.domain, 333)
         np.testing.assert_allclose(np.hypot(*spline.evaluate(at).T), radius, atol=5e-3)
 
@@ -47,7 +46,7 @@ def test_the_ribbon_between_two_straights() -> None:
     line = line_of("open")
     ribbon, splines = line.ribbon, line.sides
     assert not ribbon.periodic
-    spline, _ = ribbon.edge_spline(LEFT)
+    spline, _ = ribbon.edge(LEFT)
     np.testing.assert_allclose(spline.evaluate(np.linspace(*spline.domain, 50))[:, 1], 2.0, atol=1e-6)
     ends = [splines[0].evaluate(np.array([u]))[0, 0] for u in splines[0].domain]
     np.testing.assert_allclose([spline.evaluate(np.array([u]))[0, 0] for u in spline.domain], ends, atol=1e-3)
@@ -59,17 +58,11 @@ def test_edges_change_with_the_control_points_as_the_derivatives_say(kind: str, 
     ribbon = line_of(kind, 8.0).ribbon
     rng = np.random.default_rng(2)
     distinct = ribbon.distinct_control_points + rng.normal(0.0, 0.2, ribbon.distinct_control_points.shape)
-    u = np.sort(rng.uniform(0.0, ribbon.tables.high, 9))
-
-    def edge(values: Array) -> tuple[Array, Array]:
-        points, by_control = ribbon.with_points(values.reshape(-1, 3)).edge(u, SIDE[label])
-        return points.ravel(), by_control.reshape(2 * len(u), -1)
 
     def control_points(values: Array) -> tuple[Array, Array]:
-        spline, by_control = ribbon.with_points(values.reshape(-1, 3)).edge_spline(label)
+        spline, by_control = ribbon.with_points(values.reshape(-1, 3)).edge(label)
         return spline.distinct_control_points.ravel(), by_control
 
-    assert_jacobians(edge, [distinct.ravel()])
     assert_jacobians(control_points, [distinct.ravel()])
 
 

@@ -63,7 +63,7 @@ def circles(pose: Array, shift: Array, covariance: Array) -> CurveState:
     phi = np.linspace(0.0, 2.0 * np.pi + 1.2, 140)
     drift = np.clip((phi - 1.5 * np.pi) / (0.5 * np.pi), 0.0, 1.0)[:, None] * shift
     for label, radius in sorted(RADII.items()):
-        curve = fit_spline(around(phi, radius) + drift, 40, periodic=False)
+        curve, _ = fit_spline(around(phi, radius) + drift, 40, periodic=False)
         state.curves[label] = curve
         state.belief.mean = np.append(state.belief.mean, curve.control_points)
         state.pose_u[label] = curve.domain[1] - 0.6 * radius

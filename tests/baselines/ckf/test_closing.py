@@ -19,7 +19,6 @@ SHIFT = np.array([0.5, 0.3])
 PHI = 0.5
 """The vehicle has this angle (rad) on its second lap."""
 MIDDLE = 24.0
-REACH = 12.0
 """Distance (m) within which the loop may close."""
 COVARIANCE = np.diag([0.3, 0.3, 0.003]) ** 2
 
@@ -54,7 +53,7 @@ def beginning() -> Array:
 
 
 def test_the_motion_takes_the_drift_of_the_lap_back() -> None:
-    motion = associate_early_segment(drifted(), last_cycles(SHIFT), beginning(), REACH)
+    motion = associate_early_segment(drifted(), last_cycles(SHIFT), beginning())
     assert motion is not None
     moved = move_points(motion, around(np.array([PHI]), MIDDLE) + SHIFT)
     np.testing.assert_allclose(moved, around(np.array([PHI]), MIDDLE), atol=0.15)
@@ -62,7 +61,7 @@ def test_the_motion_takes_the_drift_of_the_lap_back() -> None:
 
 def test_detections_off_the_beginning_are_not_associated() -> None:
     """The same detections from far outside the circles do not lie on the beginning."""
-    assert associate_early_segment(drifted(), last_cycles(np.array([9.0, 9.0])), beginning(), REACH) is None
+    assert associate_early_segment(drifted(), last_cycles(np.array([9.0, 9.0])), beginning()) is None
 
 
 def test_the_correspondences_lay_the_end_on_the_beginning() -> None:
@@ -90,7 +89,7 @@ def test_closing_waits_until_the_end_has_reached_its_beginning() -> None:
 def test_simplified_circles_are_closed_and_have_a_share_of_the_cones(cones: int) -> None:
     state = circles(true_pose(PHI), np.zeros(2), COVARIANCE)
     phi = np.linspace(0.0, 2.0 * np.pi, cones, endpoint=False)
-    simplify(state, {label: list(around(phi, radius)) for label, radius in RADII.items()})
+    simplify(state, {label: dict(enumerate(around(phi, radius))) for label, radius in RADII.items()})
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
     for label, radius in RADII.items():
         curve, covariance = state.spline(label), state.covariance(label)

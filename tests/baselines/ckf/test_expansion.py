@@ -141,4 +141,6 @@ def test_two_confirmed_tracks_begin_a_curve_and_one_does_not() -> None:
 def test_each_confirmed_cone_is_observed_once() -> None:
     _, expansion = expanded(straight_rows(), np.array([[16.5, 2.0], [18.5, 2.0]]), times=6)
     assert len(expansion.observed[LEFT]) == 2 and len(expansion.observed[RIGHT]) == 0
-    np.testing.assert_allclose(np.sort(np.array(expansion.observed[LEFT])[:, 0]), [16.5, 18.5], atol=1e-9)
+    np.testing.assert_allclose(
+        np.sort(np.array([*expansion.observed[LEFT].values()])[:, 0]), [16.5, 18.5], atol=1e-9
+    )

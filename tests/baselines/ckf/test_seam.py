@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.filters import Overlap, find_overlap, make_periodic
-from pathspace_graph.settings.mapper import Knots, MapperSettings
+from pathspace_graph.baselines.filters import (
+    Overlap,
+    curvature_weighted_breaks,
+    find_overlap,
+    make_periodic,
+)
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.bspline import BSpline
+from pathspace_graph.spline.knots import fit_spline
 
 from ...scenes.maps import boundary_through
 
@@ -68,27 +75,24 @@ def test_parameters_before_the_seam_stay_and_those_after_it_go_on() -> None:
 # --- the periodic curve ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("knots", ["cones", "curvature"])
 @pytest.mark.parametrize("turns", [0.97, 1.1, 1.4])
-def test_a_circle_becomes_a_closed_circle(knots: Knots, turns: float) -> None:
-    boundary, points = circle(turns)
-    new = make_periodic(boundary, points, MapperSettings(), knots)
-    closed = boundary.closed(new.knots)
-    u = np.linspace(0.0, closed.length, 200)
-    np.testing.assert_allclose(radii(closed.evaluate(new.points, u)), RADIUS, atol=0.2)
-    ends = [closed.evaluate(new.points, np.array([at]), 1)[0] for at in (0.0, closed.length - 1e-9)]
-    np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+def test_a_circle_becomes_a_closed_circle(turns: float) -> None:
+    _, closed, _ = make_periodic(*circle(turns), MapperSettings())
+    assert closed.periodic
+    u = np.linspace(*closed.domain, 200)
+    np.testing.assert_allclose(radii(closed.evaluate(u)), RADIUS, atol=0.2)
 
 
-def test_the_change_of_variables_gives_the_old_curve_back() -> None:
-    """`C_old = E C_new`, also where the curve overlaps itself. The rows of E sum to one."""
+def test_the_change_of_variables_is_a_mean_of_the_old_control_points() -> None:
+    """`C_new = F C`: the rows of F sum to one, and the new curve lies on the old one where that overlaps."""
     boundary, points = circle(1.3)
-    new = make_periodic(boundary, points, MapperSettings(), "cones")
-    assert new.old_from_new.shape == (boundary.size, len(new.points))
-    np.testing.assert_allclose(new.old_from_new.sum(axis=1), 1.0, atol=1e-9)
+    overlap, closed, change = make_periodic(boundary, points, MapperSettings())
+    np.testing.assert_allclose(change @ points, closed.distinct_control_points)
+    np.testing.assert_allclose(change.sum(axis=1), 1.0, atol=1e-6)
     u = np.linspace(1.0, boundary.confirmed_end - 1.0, 100)
-    found = boundary.evaluate(new.old_from_new @ new.points, u)
-    np.testing.assert_allclose(found, boundary.evaluate(points, u), atol=0.15)
+    np.testing.assert_allclose(
+        closed.evaluate(overlap.new_parameter(u)), boundary.evaluate(points, u), atol=0.15
+    )
 
 
 @pytest.mark.parametrize(("share", "size"), [(0.43, 15), (0.25, 9), (0.1, 8)])
@@ -97,10 +101,60 @@ def test_the_size_is_a_share_of_the_cones_of_one_lap(share: float, size: int) ->
     settings = MapperSettings()
     settings = replace(settings, spline=replace(settings.spline, size_share=share))
     for turns in (1.1, 1.4):
-        assert len(make_periodic(*circle(turns), settings, "cones").points) == size
+        assert make_periodic(*circle(turns), settings)[1].size == size
 
 
 def test_the_size_of_a_line_is_a_share_of_places_3_m_apart_and_not_of_its_points() -> None:
     """A lap of 94 m has 31 of them before the seam, of which 0.43 are 13, however many points were merged."""
-    new = make_periodic(*circle(1.1), MapperSettings(kind="line"), "cones")
-    assert len(new.points) == 13
+    assert make_periodic(*circle(1.1), MapperSettings(kind="line"))[1].size == 13
+
+
+# --- knots by curvature ----------------------------------------------------------------------------------
+
+
+def hairpin() -> Array:
+    """Two straights of 40 m joined by a half circle of radius 4 m, a point every metre."""
+    x = np.arange(0.0, 40.0)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 13)
+    bend = np.stack([40.0 + 4.0 * np.cos(angle), 4.0 + 4.0 * np.sin(angle)], axis=1)
+    there = np.stack([x, np.zeros(40)], axis=1)
+    back = np.stack([x[::-1], np.full(40, 8.0)], axis=1)
+    return np.concatenate([there, bend, back])
+
+
+def test_knots_gather_in_a_corner_and_keep_a_minimum_on_straights() -> None:
+    spline, _ = fit_spline(hairpin(), 60, periodic=False)
+    corner = spline.foot_points(np.array([[40.0, 0.0], [40.0, 8.0]])).u
+    densities = []
+    for baseline in (1.0, 0.5, 0.2):
+        breaks = curvature_weighted_breaks(spline, 24, baseline, *spline.domain)
+        assert (np.diff(breaks) > 0.0).all()
+        assert (breaks[0], breaks[-1]) == spline.domain
+        bent = (breaks > corner[0]) & (breaks < corner[1])
+        densities.append(int(bent.sum()))
+        longest = np.diff(spline.arc_length(breaks)).max()
+        assert longest <= 1.05 * spline.length() / (24 * baseline)
+    share = (corner[1] - corner[0]) / (spline.domain[1] - spline.domain[0])
+    assert densities[0] == pytest.approx(24 * share, abs=1.5)
+    assert densities[0] + 6 <= densities[1] < densities[2]
+
+
+def test_a_kink_does_not_attract_all_knots() -> None:
+    """Three control points of a circle coincide."""
+    angle = 2.0 * np.pi * np.arange(40) / 40
+    points = 10.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    points[[19, 21]] = points[20]
+    spline = BSpline.periodic_from(np.arange(41.0), points)
+    breaks = curvature_weighted_breaks(spline, 20, 0.0, *spline.domain)
+    assert np.diff(spline.arc_length(breaks)).max() < 8.0
+
+
+def test_knots_past_the_end_of_an_open_curve_are_even() -> None:
+    """It is straight there, as long as on average for each parameter."""
+    spline = BSpline.open_uniform(np.column_stack([2.0 * np.arange(12.0), np.sin(np.arange(12.0))]))
+    low, high = spline.domain
+    breaks = curvature_weighted_breaks(spline, 30, 0.5, low, high + 6.0)
+    assert (breaks[0], breaks[-1]) == (low, high + 6.0)
+    assert (np.diff(breaks) > 0.0).all()
+    beyond = np.diff(breaks[breaks > high])
+    np.testing.assert_allclose(beyond, beyond[0], rtol=1e-6)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.association import Cones, first_parameter, seen_by_most
 from pathspace_graph.batch.joint import (
     OTHER_TRACK,
-    JointSystem,
     PlacedDrive,
     drives_of,
     joint_state,
+    joint_system,
     solve_together,
 )
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
@@ -50,8 +50,7 @@ def test_drives_of_one_vehicle_share_its_sensor() -> None:
 def test_one_drive_is_the_problem_that_it_is_alone() -> None:
     """From its optimum the search goes nowhere."""
     (one,) = placed("")
-    system = JointSystem([one])
-    at, convergence = Optimizer(system).find(joint_state(system, one))
+    at, convergence = Optimizer(joint_system([one])).find(joint_state([one], one))
     assert convergence.converged
     assert at.cost == pytest.approx(one.alone.cost, rel=0.01)
     np.testing.assert_allclose(at.state.poses, one.state.poses, atol=0.03)
@@ -59,8 +58,8 @@ def test_one_drive_is_the_problem_that_it_is_alone() -> None:
 
 def test_the_rows_are_the_derivatives_of_every_drives_residuals() -> None:
     """The odometry of each drive depends on its own calibration, and the sensors' priors on their own."""
-    system = JointSystem(placed("", "", ""))
-    state = joint_state(system, system.placed[0])
+    drives = placed("", "", "")
+    system, state = joint_system(drives), joint_state(drives, drives[0])
     layout, rng = state.variables.layout, np.random.default_rng(0)
     step = 1e-6 * rng.normal(size=layout.size)
     before, after = system.drive_rows(state), system.drive_rows(stepped(state, step))
@@ -75,18 +74,18 @@ def test_the_rows_are_the_derivatives_of_every_drives_residuals() -> None:
 
 def test_odometry_of_two_drives_is_in_one_factor_only_where_they_meet() -> None:
     """A factor across two groups of poses takes twice the time."""
-    system = JointSystem(placed("", ""))
-    rows = system.drive_rows(joint_state(system, system.placed[0]))
+    drives = placed("", "")
+    rows = joint_system(drives).drive_rows(joint_state(drives, drives[0]))
     odometry = [one.owner for one in rows if one.keys.shape[1] == 3]
     assert len(odometry) == 2
     assert len(np.intersect1d(*odometry)) <= 1
 
 
 def test_wider_priors_of_one_drive_are_those_of_its_calibrations_alone() -> None:
-    system = JointSystem(placed("", ""))
-    state = joint_state(system, system.placed[0])
+    drives = placed("", "")
+    system, state = joint_system(drives), joint_state(drives, drives[0])
     before = system.drive_rows(state)
-    settings = system.placed[1].settings
+    settings = drives[1].settings
     odometry, sensor = settings.odometry, settings.calibration
     wide = replace(
         settings,
@@ -111,13 +110,13 @@ def test_the_sensor_of_a_vehicle_begins_at_the_mean_of_its_drives() -> None:
     drives = [PlacedDrive(str(k), result, np.zeros(3), "red") for k, result in enumerate((one, other))]
     sensors = [result.optimum.state.variables.sensor for result in (one, other)]
     assert np.abs(sensors[0] - sensors[1]).max() > 1e-4
-    state = joint_state(JointSystem(drives), drives[0])
+    state = joint_state(drives, drives[0])
     np.testing.assert_allclose(state.variables.sensor, 0.5 * (sensors[0] + sensors[1]))
 
 
 def test_only_the_first_drive_has_a_first_pose() -> None:
-    system = JointSystem(placed("", ""))
-    rows = system.drive_rows(joint_state(system, system.placed[0]))
+    drives = placed("", "")
+    rows = joint_system(drives).drive_rows(joint_state(drives, drives[0]))
     alone_on_poses = [one.keys[0, 0] for one in rows if one.keys.shape[1] == 1 and len(one.jacobian[0]) == 3]
     assert len(alone_on_poses) == 1
 
@@ -198,9 +197,9 @@ def test_a_log_that_cannot_be_solved_alone_is_left_out() -> None:
 
 def test_a_cone_that_most_drives_have_not_seen_is_none() -> None:
     """Of three drives one has seen a cone beside the road; a second one would make it a half."""
-    system = JointSystem(placed("", "", ""))
-    state = joint_state(system, system.placed[0])
-    label, starts = next(iter(state.boundaries)), np.array(system.drives.first)
+    drives = placed("", "", "")
+    system, state = joint_system(drives), joint_state(drives, drives[0])
+    label, starts = next(iter(state.boundaries)), np.array(state.drives.first)
     curve = state.spline(label)
     u = curve.domain[0] + 5.0
     cone = Cones(curve.evaluate(np.array([u])), np.array([u - first_parameter(state, label)]), np.array([6]))

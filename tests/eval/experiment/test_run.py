@@ -17,9 +17,8 @@ from pathspace_graph.errors import OutputError, SettingsError
 from pathspace_graph.eval.experiment import run as study_run
 from pathspace_graph.eval.experiment import study as study_module
 from pathspace_graph.eval.experiment.run import run_study
-from pathspace_graph.eval.experiment.statistics import TIMES
 from pathspace_graph.eval.experiment.study import Drive, Study
-from pathspace_graph.eval.experiment.tables import without_times, write_study
+from pathspace_graph.eval.experiment.tables import TIMES, without_times, write_study
 from pathspace_graph.io.log import Log
 from pathspace_graph.plausibility.judge import Hint
 
@@ -149,14 +148,6 @@ def test_a_killed_study_goes_on_where_it_was_with_the_same_results(
     first, second = contents(finished), contents(killed)
     for name in ("results.csv", "study.json"):
         assert first[name] == second[name]
-
-
-def test_a_damaged_cell_is_made_again(study: Study, ran: tuple[Path, pd.DataFrame], finished: Path) -> None:
-    cells = sorted((finished / "cells").iterdir())
-    cells[0].write_text("{")
-    again = run_study(study, finished)
-    assert Pretender.calls + Fragile.calls == 1
-    pd.testing.assert_frame_equal(without_times(ran[1]), without_times(again))
 
 
 def test_cells_of_other_code_are_run_again_and_counted(

@@ -3,33 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy import stats
-from scipy.stats import binomtest
 
-from pathspace_graph.eval.experiment.plots import plot_differences
 from pathspace_graph.eval.experiment.run import add_batch
-from pathspace_graph.eval.experiment.statistics import (
+from pathspace_graph.eval.experiment.study import Baseline, Published, Study, find_study, read_study_file
+from pathspace_graph.eval.experiment.tables import (
     RUN,
+    beside_published,
     by_track,
+    caption,
     contrasts,
     estimate,
     holm,
+    joined,
     paired_p,
+    plot_differences,
+    plot_published,
+    summary_tables,
     wilcoxon_p,
+    write_study,
 )
-from pathspace_graph.eval.experiment.study import Baseline, Study
-from pathspace_graph.eval.experiment.tables import caption, joined, summary_tables
 from pathspace_graph.eval.figures.style import Picture
 
 
 def test_few_values_have_no_interval_and_equal_ones_none_to_speak_of() -> None:
     one = estimate(np.array([-2.0]))
-    assert (one.mean, one.count) == (-2.0, 1) and np.isnan(one.half)
+    assert one.mean == -2.0 and np.isnan(one.half)
     assert np.isnan(estimate(np.zeros(0)).mean)
     same = estimate(np.ones(2))
     assert (same.mean, same.half) == (1.0, 0.0)
@@ -37,7 +42,7 @@ def test_few_values_have_no_interval_and_equal_ones_none_to_speak_of() -> None:
 
 def test_the_interval_of_few_and_p_are_those_of_scipy() -> None:
     values = np.random.default_rng(1).normal(0.3, 1.0, 7)
-    made = estimate(values)
+    made = estimate([*values, np.nan])  # what isn't known doesn't count
     low, high = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
     assert made.mean - made.half == pytest.approx(low)
     assert made.mean + made.half == pytest.approx(high)
@@ -124,9 +129,8 @@ def test_differences_are_paired() -> None:
 def test_a_failed_run_is_left_out_with_its_pair() -> None:
     frame = rows({"default": 0.0, "lag=1": 0.1, "lag=2": 0.0}, failed=(3, 1))
     _, worse, _ = (c for c in contrasts(STUDY, frame, "rmse") if c.noise == "nominal")
-    assert (worse.runs, worse.value.count) == (7, 4)
+    assert (worse.runs, len(worse.differences)) == (7, 4)
     assert worse.difference is not None
-    assert worse.difference.count == 4
     assert worse.difference.mean == pytest.approx(0.1, abs=0.02)
     assert "(2 failed)" in caption(STUDY, frame)
 
@@ -154,42 +158,6 @@ def test_one_estimator_can_be_the_baseline_of_all() -> None:
 
 
 # --- what is found, and what is not -----------------------------------------------------------------------
-
-
-def resampled(effect: float, rng: np.random.Generator) -> tuple[Study, pd.DataFrame]:
-    """A study of 20 drives over 5 tracks whose variant differs by `effect` on the average.
-
-    The differences on a track have 0.1 m in common, and 0.03 m are of the drive.
-    """
-    study = replace(STUDY, tracks=(0, 1, 2, 3, 4), seeds=(0, 1, 2, 3), noise={"nominal": {}})
-    study = replace(study, grids=({"lag": [1.0]},), metrics=("rmse",))
-    made = []
-    for track in range(5):
-        hard, own = rng.uniform(0.1, 1.0), effect + 0.1 * rng.standard_normal()
-        for seed in range(4):
-            value = hard + 0.05 * rng.standard_normal()
-            for variant, by in {"default": 0.0, "lag=1": own + 0.03 * rng.standard_normal()}.items():
-                names = {"track": str(track), "seed": seed, "noise": "nominal", "estimator": "fixed-lag"}
-                made.append(names | {"variant": variant, "lap": 2, "failure": "", "rmse": value + by})
-    return study, pd.DataFrame(made)
-
-
-def test_a_planted_difference_is_found_and_none_where_there_is_none() -> None:
-    """Of 200 studies without a difference, 2 to 9 % find one; over single drives it would be 38 %."""
-    rng = np.random.default_rng(3)
-    found, of_drives = [], []
-    for _ in range(200):
-        study, frame = resampled(0.0, rng)
-        found.append(contrasts(study, frame, "rmse")[1].significant)
-        wide = frame.pivot(index=["track", "seed"], columns="variant", values="rmse")
-        of_drives.append(paired_p((wide["lag=1"] - wide["default"]).to_numpy()) < 0.05)
-    low, high = binomtest(10, 200).proportion_ci()
-    assert low < np.mean(found) < high
-    assert np.mean(of_drives) > 0.3
-    planted = [contrasts(*resampled(0.3, rng), "rmse")[1] for _ in range(20)]
-    assert np.mean([contrast.significant for contrast in planted]) > 0.9
-    means = [contrast.difference.mean for contrast in planted if contrast.difference]
-    assert np.mean(means) == pytest.approx(0.3, abs=0.03)
 
 
 def test_what_is_the_same_and_wall_times_are_not_tested() -> None:
@@ -267,22 +235,9 @@ def test_rows_of_all_panels_are_the_same_where_one_metric_lacks_some() -> None:
     frame.loc[frame["variant"] == "lag=2", "missed"] = 0.5
     drawn = plot_differences(STUDY, frame)
     first, second = drawn.axes
-    assert [label.get_text() for label in first.get_yticklabels()] == ["nominal, lag=1", "nominal, lag=2"]
+    assert [label.get_text() for label in first.get_yticklabels()] == ["lag=1", "lag=2"]
     means = [container.lines[0].get_ydata().tolist() for container in second.containers]
     assert means == [[1]]
-
-
-def test_a_figure_names_settings_without_their_group_where_that_is_enough() -> None:
-    shift = {"default": 0.0, "spline.degree=2, lag=1": 0.1}
-    named = rows(shift)
-
-    def label(study: Study) -> str:
-        drawn = plot_differences(study, named)
-        (panel,) = drawn.axes
-        return str(panel.get_yticklabels()[0].get_text())
-
-    study = replace(STUDY, noise={"nominal": {}}, grids=({"spline.degree": [2], "lag": [1.0]},))
-    assert label(study) == "degree=2, lag=1"
 
 
 def row(estimator: str, seed: int = 0, variant: str = "default", **values: float) -> dict[str, Any]:
@@ -313,3 +268,69 @@ def test_a_batch_that_failed_compares_with_nothing() -> None:
     rows = [row("fixed-lag", turn=0.003, rmse=0.4), row("spline")]
     add_batch(rows, (*RUN, "noise", "variant"))
     assert "turn_from_batch" not in rows[0]
+
+
+# --- beside a publication --------------------------------------------------------------------------------
+
+
+def published(*estimators: str) -> tuple[Study, pd.DataFrame]:
+    """Two tracks of two laps, with an rmse of 1 and 2 m on the first track and half on the second."""
+    laps = {name: {"missed": [10.0 * (k + 1), 0.0], "rmse": [1.0, 4.0]} for k, name in enumerate(estimators)}
+    about = Published("a paper", laps, {"rmse": "other track"})
+    study = Study(tracks=(0, 1), estimators=estimators, laps=2, published=about)
+    rows = [
+        {
+            "study": "made up",
+            "track": track,
+            "seed": 0,
+            "noise": "nominal",
+            "estimator": name,
+            "variant": "default",
+        }
+        | {"lap": lap, "failure": "", "rmse": lap * (k + 1) / (1 + i), "missed": 0.1 * (k + 1)}
+        for i, track in enumerate(("a", "b"))
+        for k, name in enumerate(estimators)
+        for lap in (1, 2)
+    ]
+    return study, pd.DataFrame(rows)
+
+
+def test_published_values_stand_beside_ours_of_the_same_lap_in_the_same_unit() -> None:
+    found = beside_published(*published("ckf", "landmark-ckf")).set_index(["metric", "estimator", "lap"])
+    first = found.loc[("rmse [m]", "landmark-ckf", 2)]
+    assert first[["published", "here", "difference"]].tolist() == [4.0, 3.0, -1.0]
+    assert first["compared"] == "other track"
+    low, high = stats.ttest_1samp([4.0, 2.0], 0.0).confidence_interval(0.95)
+    assert first["interval"] == pytest.approx(0.5 * (high - low))
+    missed = found.loc[("missed [%]", "ckf", 1)]
+    assert missed[["published", "here", "difference"]].tolist() == pytest.approx([10.0, 10.0, 0.0])
+    ratio = found.loc[("rmse", "ckf / landmark-ckf", 2)]
+    assert ratio[["published", "here", "compared"]].tolist() == [1.0, 0.5, "ratio"]
+    assert ("missed", "ckf / landmark-ckf", 2) not in found.index  # nothing was missed there
+
+
+def test_a_lap_that_was_not_driven_is_left_out() -> None:
+    study, frame = published("ckf")
+    found = beside_published(study, frame[frame["lap"] == 1])
+    assert found["lap"].tolist() == [1, 1] and len(plot_published(found).axes) == 2
+    assert len(beside_published(study, frame.drop(columns=["rmse", "missed"]))) == 0
+
+
+def test_what_is_shown_beside_a_publication_is_written_and_without_it_nothing(tmp_path: Path) -> None:
+    study, frame = published("ckf", "landmark-ckf")
+    text = write_study(study, frame, tmp_path / "out")
+    assert "Beside a paper" in text and "other track" in text
+    assert (tmp_path / "out" / "published.csv").is_file()
+    assert (tmp_path / "out" / "figures" / "published.png").is_file()
+    text = write_study(replace(study, published=Published()), frame, tmp_path / "none")
+    assert "Beside" not in text and not (tmp_path / "none" / "published.csv").exists()
+
+
+def test_the_table_of_the_paper_is_shipped() -> None:
+    """The text says that it has 16.8 % less rmse, and 44 % of the size after lap 5."""
+    laps = read_study_file(find_study(Path("paper"))).published.laps
+    ratio = {key: np.divide(laps["ckf"][key], laps["landmark-ckf"][key]) for key in ("rmse", "size")}
+    assert 1.0 - ratio["rmse"].mean() == pytest.approx(0.168, abs=3e-3)
+    assert ratio["size"][-1] == pytest.approx(0.44, abs=1e-3)
+    for of_laps in laps.values():
+        np.testing.assert_allclose(of_laps["size_share"], np.array(of_laps["size"]) / 2.0)

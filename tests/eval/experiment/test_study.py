@@ -7,6 +7,7 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError, SettingsError
@@ -20,16 +21,19 @@ from pathspace_graph.eval.experiment.study import (
     load_tracks,
     read_study_file,
     shipped_studies,
+    simulated_drive,
     study_from,
+    track_digest,
 )
 from pathspace_graph.eval.metrics.summary import lap_times
-from pathspace_graph.io.overrides import as_type, leaves, override
+from pathspace_graph.io.overrides import leaves, override
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import CAMERA, CAMERA_FAULTS, INS, INS_RATE, SimulationSettings, simulate
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.vehicle import VehicleSettings
 
 from ...scenes.paths import ROOT
+from ...scenes.pretenders import write_round_track
 
 WHOLE = """
 question = "Why?"
@@ -120,7 +124,7 @@ def test_all_estimators() -> None:
         ("tracks = [-1]", "tracks: expected whole numbers"),
         ("tracks = [0]\nseeds = 3", "seeds: expected a list"),
         ("tracks = [0]\nseeds = [0.5]", "seeds: expected whole numbers"),
-        ("tracks = [0]\nlaps = 0", "laps: expected a positive number"),
+        ("tracks = [0]\nlaps = 0", "laps: expected a positive whole number"),
         ("tracks = [0]\nlaps = true", "laps: expected a whole number"),
         ("tracks = [0]\nlap = 1", "found 'lap', the nearest is 'laps'"),
         ("tracks = [0]\nname = 1", "name: expected text"),
@@ -129,9 +133,9 @@ def test_all_estimators() -> None:
         ("tracks = [0]\ngrid.spline.degre = [1]", "found 'spline.degre', the nearest is 'spline.degree'"),
         ("tracks = [0]\ngrid.lag = 1.0", "grid.lag: expected a list"),
         ("tracks = [0]\ngrid.lag = []", "grid.lag: expected a list"),
-        ('tracks = [0]\ngrid.lag = ["long"]', "grid.lag: expected a number, found 'long'"),
-        ("tracks = [0]\ngrid.lag = [-1.0]", "grid.lag: lag: expected a positive number, found -1.0"),
-        ("tracks = [0]\ngrid.steps = [1.5]", "grid.steps: expected a whole number"),
+        ('tracks = [0]\ngrid.lag = ["long"]', "grid.lag: expected a positive number, found 'long'"),
+        ("tracks = [0]\ngrid.lag = [-1.0]", "grid.lag: expected a positive number, found -1.0"),
+        ("tracks = [0]\ngrid.steps = [1.5]", "grid.steps: expected a positive whole number"),
         ("tracks = [0]\ngrid.spline = [1]", "found 'spline'"),
         ("tracks = [0]\nvariants.default.lag = 1.0", "variants.default: that name is kept"),
         ("tracks = [0]\nvariants.fast = 1", "variants.fast: expected a table"),
@@ -142,6 +146,11 @@ def test_all_estimators() -> None:
         ('tracks = [0]\nbaseline.variant = "defualt"', "found 'defualt', the nearest is 'default'"),
         ('tracks = [0]\nbaseline.estimator = "spline"', "baseline.estimator: expected one of the study's"),
         ('tracks = [0]\nbaseline.settings = "x"', "baseline: expected a known key"),
+        ("tracks = [0]\npublished = 1", "published: expected a table"),
+        ('tracks = [0]\npublished.note = "x"', "published: Object contains unknown field `note`"),
+        ("tracks = [0]\npublished.laps.ckf.rmse = [1.0]", "published.laps: expected one of the study's"),
+        ("tracks = [0]\npublished.laps.fixed-lag.rsme = [1]", "found 'rsme', the nearest is 'rmse'"),
+        ('tracks = [0]\npublished.laps.fixed-lag.rmse = ["x"]', "published: Expected `float`, got `str`"),
     ],
 )
 def test_what_is_unknown_or_wrong_is_refused(text: str, says: str) -> None:
@@ -224,7 +233,9 @@ def test_every_shipped_study_is_sound_and_listed(name: str) -> None:
 
 def test_the_examples_of_the_pages_are_sound() -> None:
     text = (ROOT / "docs" / "ablate.md").read_text()
-    example, logs = re.findall(r"```toml\n(.*?)```", text, flags=re.DOTALL)
+    example, logs, published = re.findall(r"```toml\n(.*?)```", text, flags=re.DOTALL)
+    beside = study(f'tracks = [0]\nestimators = ["ckf"]\n{published}').published
+    assert beside.laps == {"ckf": {"rmse": [0.58, 0.62]}} and set(beside.notes) == {"rmse"}
     assert set(tomllib.loads(logs.split("\n\n")[1])["drives"]) == {"logs"}
     assert len(study(example).points) == 1 + 1 + 3
 
@@ -236,14 +247,6 @@ def test_every_leaf_of_both_trees_can_be_set_to_what_it_is() -> None:
     for tree in (MapperSettings(), SimulationSettings()):
         values = {name: value for name, value in leaves(tree).items() if value is not None}
         assert override(tree, values, "here") == tree
-
-
-def test_types_of_toml_become_those_of_the_fields() -> None:
-    assert as_type([1, 2], tuple[float, ...], "x") == (1.0, 2.0)
-    assert as_type(3, int | None, "x") == 3
-    for value, hint in ((True, float), (True, int), (1, bool), ([1], tuple[float, float]), ("1", float)):
-        with pytest.raises(SettingsError, match="x: expected"):
-            as_type(value, hint, "x")
 
 
 # --- cells -----------------------------------------------------------------------------------------------
@@ -273,3 +276,67 @@ def test_a_cell_is_known_by_what_it_runs_not_by_what_it_is_called() -> None:
     assert grid.id == named.id
     longer = make_plan(Study(tracks=(0,), laps=6)).cells[0]
     assert longer.id != make_plan(Study(tracks=(0,))).cells[0].id
+
+
+# --- drives ----------------------------------------------------------------------------------------------
+
+
+def folder_of_two(folder: Path) -> Path:
+    """A folder with two track files, and a file that is none."""
+    folder.mkdir()
+    track = write_round_track(folder)
+    track.rename(folder / f"another{track.suffix}")
+    write_round_track(folder)
+    (folder / "README.md").write_text("no track")
+    return folder
+
+
+def test_a_folder_stands_for_its_track_files_in_order(tmp_path: Path) -> None:
+    folder = folder_of_two(tmp_path / "tracks")
+    names = sorted(file.stem for file in folder.iterdir() if file.suffix != ".md")
+    assert [track.name for track in load_tracks([folder, 3])] == [*names, "generated 3"]
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    files = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        files.append(write_round_track(tmp_path / name))
+    assert [track.name for track in load_tracks(files)] == [f"{n}/{files[0].stem}" for n in ("a", "b")]
+
+
+def test_a_folder_without_tracks_and_a_missing_file_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected track files"):
+        load_tracks([tmp_path])
+    track = write_round_track(tmp_path)
+    wrong = track.with_name(f"x{track.name}")
+    with pytest.raises(InputError, match=f"the nearest is '{track.name}'"):
+        load_tracks([wrong])
+
+
+def test_a_drive_is_the_same_by_geometry_seed_and_simulation_whatever_its_names() -> None:
+    (track,) = load_tracks([0])
+    two, three = (SimulationSettings(laps=laps) for laps in (2, 3))
+    drive, renamed = simulated_drive(track, 0, "nominal", two), replace(track, name="another name")
+    assert simulated_drive(renamed, 0, "quiet", two).id == drive.id
+    assert simulated_drive(track, 1, "nominal", two).id != drive.id
+    assert simulated_drive(track, 0, "nominal", three).id != drive.id
+
+
+def test_the_last_digits_of_a_track_do_not_matter_to_its_drives_and_a_centimetre_does() -> None:
+    (track,) = load_tracks([0])
+    simple = replace(track, other=np.array([[-0.0, 0.0005], [1.0, 2.5 / 3.0]]))
+    for one in (track, simple):
+        for shift in (-1e-12, 1e-12):
+            moved = {name: getattr(one, name) + shift for name in ("left", "right", "other", "start")}
+            assert track_digest(replace(one, **moved)) == track_digest(one)
+        for name in ("left", "right", "start"):
+            cone_moved = getattr(one, name).copy()
+            cone_moved.flat[-1] += 0.01
+            assert track_digest(replace(one, **{name: cone_moved})) != track_digest(one)
+    assert track_digest(replace(simple, other=np.abs(simple.other))) == track_digest(simple)
+
+
+def test_the_drives_of_a_generated_track_are_those_of_every_machine() -> None:
+    """Another number makes other drives on all generated tracks, and all figures of the pages old."""
+    assert simulated_drive(load_tracks([0])[0], 0, "nominal", SimulationSettings()).source == "3921578876"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.experiment.run import WorkerDiedError, outcomes, run_study, workers
+from pathspace_graph.errors import SettingsError, SolveError
+from pathspace_graph.eval.experiment.run import rows_of, run_study
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.eval.experiment.tables import without_times
 
@@ -60,16 +61,27 @@ def test_a_cluster_that_is_not_there_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_worker_that_dies_takes_only_its_own_work_with_it() -> None:
-    def work(item: int) -> int:
-        if item == 3:
-            import os  # noqa: PLC0415 - it runs elsewhere
+TENFOLD = """
+import os
 
-            os._exit(1)
-        return 10 * item
 
-    with workers(2):
-        found = dict(outcomes(work, list(range(6))))
-    died = found.pop(3)
-    assert isinstance(died, WorkerDiedError)
-    assert found == {item: 10 * item for item in (0, 1, 2, 4, 5)}
+def tenfold(item):
+    if item == 3:
+        os._exit(7)
+    return [{"item": item, "times": 10 * item}]
+"""
+"""A module of rows, each ten times an item; three kills its process."""
+
+
+def test_a_worker_that_dies_takes_only_its_own_work_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "module").mkdir()
+    (tmp_path / "module" / "tenfold_rows.py").write_text(TENFOLD, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path / "module")  # other processes cannot import the tests
+    tenfold = import_module("tenfold_rows").tenfold
+    with pytest.raises(SolveError, match=r"^3: WorkerDiedError: .*EXIT\(7\)"):
+        rows_of(tenfold, [{"item": item} for item in range(6)], tmp_path, jobs=2)
+    assert len([*(tmp_path / "cells").iterdir()]) == 6
+    left = rows_of(tenfold, [{"item": item} for item in (0, 1, 2, 4, 5)], tmp_path)
+    assert left["times"].tolist() == [0, 10, 20, 40, 50]

@@ -16,10 +16,8 @@ from pathspace_graph.eval.figures.style import (
     draw_band,
     ellipse_outlines,
     figure_context,
-    fit_height,
     save_figures,
     save_plot,
-    set_frame,
     shared_legend,
     uncertainty_band,
 )
@@ -46,27 +44,6 @@ def test_a_shared_legend_names_each_thing_once_a_boundary_after_the_other() -> N
     figure = two_panels(["start", "right band", "left band"], ["left band", "left boundary"])
     shared_legend(figure)
     assert texts(figure) == ["left band", "left boundary", "right band", "start"]
-
-
-def test_a_figure_is_as_high_as_what_is_drawn_and_a_margin() -> None:
-    """Two square panels beside each other leave more than half of the height free."""
-    figure = two_panels(["a"], ["b"])
-    for axes in figure.axes:
-        set_frame(axes, np.array([0.0, 0.0]), np.array([2.0, 2.0]))
-    shared_legend(figure)
-    fit_height(figure)
-    figure.draw_without_rendering()
-    width, height = figure.get_size_inches()
-    drawn = figure.get_tightbbox().height
-    assert width == 7.0
-    assert drawn + 0.1 <= height < drawn + 0.2 < 4.5
-
-
-def test_a_frame_has_equal_scales() -> None:
-    axes = Figure().subplots()
-    set_frame(axes, np.array([-1.0, 2.0]), np.array([3.0, 4.0]))
-    assert axes.get_aspect() == 1.0
-    assert (axes.get_xlim(), axes.get_ylim()) == ((-1.0, 3.0), (2.0, 4.0))
 
 
 def test_the_context_is_left_as_it_was() -> None:

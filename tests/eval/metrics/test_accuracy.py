@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.accuracy import (
     boundary_distances,
+    boundary_errors,
     cone_distances,
     cone_errors,
     crossings,
-    curve_distance,
     driving_order,
-    ghosts,
     lap_metrics,
     mapped_points,
     true_curve,
@@ -42,17 +41,10 @@ def labelled(
     )
 
 
-def straight(y: float, covariance: Array | None = None) -> SplineBoundary:
-    """The line from (0, y) to (10, y) with control points every 10/3 m."""
-    points = np.column_stack([np.linspace(0.0, 10.0, 4), np.full(4, y)])
-    spline = BSpline.clamped_from(np.array([0.0, 10.0]), points)
-    return SplineBoundary(spline, np.zeros((8, 8)) if covariance is None else covariance)
-
-
 def test_table_of_a_spline_map() -> None:
     """Errors 0.3 and 0.4 to their own lines, one at 3.0 (found), one beyond the end at 5 (missed)."""
     true = labelled([(5, 2.3, LEFT), (1, -2.4, RIGHT), (5, 5.0, LEFT), (13, 6.0, LEFT), (5, 0.0, UNKNOWN)])
-    row = lap_metrics(Map(False, {LEFT: straight(2.0), RIGHT: straight(-2.0)}), true, lap=4)
+    row = lap_metrics(Map(False, {LEFT: line(2.0), RIGHT: line(-2.0)}), true, lap=4)
     assert row.lap == 4
     assert row.size == 8
     assert row.missed == 0.25
@@ -61,13 +53,13 @@ def test_table_of_a_spline_map() -> None:
 
 def test_a_cone_counts_to_its_own_boundary_only() -> None:
     true = labelled([(5, 2.0, RIGHT)])
-    row = lap_metrics(Map(False, {LEFT: straight(2.0), RIGHT: straight(0.5)}), true, 1)
+    row = lap_metrics(Map(False, {LEFT: line(2.0), RIGHT: line(0.5)}), true, 1)
     assert row.rmse == pytest.approx(1.5)
 
 
 def test_an_absent_boundary_is_missed_as_a_whole() -> None:
     true = labelled([(5, 2, LEFT), (6, 2, LEFT), (7, 2, LEFT), (5, -2, RIGHT)])
-    row = lap_metrics(Map(False, {RIGHT: straight(-2.0)}), true, 1)
+    row = lap_metrics(Map(False, {RIGHT: line(-2.0)}), true, 1)
     assert (row.missed, row.rmse, row.size) == (0.75, pytest.approx(0.0, abs=1e-12), 4)
     nothing = lap_metrics(Map(False, {}), true, 1)
     assert nothing.missed == 1.0 and np.isnan(nothing.rmse) and nothing.size == 0
@@ -152,24 +144,24 @@ def test_mapped_points_stand_for_equal_lengths() -> None:
 
 def test_curve_distance_of_a_parallel_and_of_half_a_curve() -> None:
     true = truth(row(2.0), row(-2.0))
-    found = curve_distance(Map(False, {LEFT: line(2.3), RIGHT: line(-2.3)}), true)
+    found = boundary_errors(Map(False, {LEFT: line(2.3), RIGHT: line(-2.3)}), true)
     assert found["mapped_to_truth"] == pytest.approx(0.3, abs=2e-3)
     assert found["truth_to_mapped"] == pytest.approx(0.3)
     # half of it: nothing from the half to the whole, and 2.5 m on average back on the half that isn't mapped
-    half = curve_distance(Map(False, {LEFT: line(2.0, end=5.0)}), truth(row(2.0)))
+    half = boundary_errors(Map(False, {LEFT: line(2.0, end=5.0)}), truth(row(2.0)))
     assert half["mapped_to_truth"] == pytest.approx(0.0, abs=0.03)
     assert half["truth_to_mapped"] == pytest.approx(1.25, abs=0.03)
 
 
 def test_curve_distance_charges_landmarks_for_the_gaps_and_an_absent_boundary_for_all() -> None:
     true = truth(row(2.0))
-    found = curve_distance(Map(False, {LEFT: landmarks((0, 2), (5, 2), (10, 2))}), true)
+    found = boundary_errors(Map(False, {LEFT: landmarks((0, 2), (5, 2), (10, 2))}), true)
     assert found["mapped_to_truth"] == pytest.approx(0.0, abs=1e-9)
     assert found["truth_to_mapped"] == pytest.approx(1.25, abs=0.02)  # a quarter of the gap
-    absent = curve_distance(Map(False, {}), true)
+    absent = boundary_errors(Map(False, {}), true)
     assert np.isnan(absent["mapped_to_truth"]) and absent["truth_to_mapped"] == np.inf
-    nothing = curve_distance(Map(False, {LEFT: line(0.0)}), truth(np.zeros((0, 2))))
-    assert np.isnan([*nothing.values()]).all()
+    nothing = boundary_errors(Map(False, {LEFT: line(0.0)}), truth(np.zeros((0, 2))))
+    assert np.isnan([nothing["mapped_to_truth"], nothing["truth_to_mapped"]]).all()
 
 
 def test_ghost_landmarks() -> None:
@@ -182,16 +174,16 @@ def test_ghost_landmarks() -> None:
             RIGHT: landmarks((2.5, -2)),
         },
     )
-    found = ghosts(track, true)
-    assert found == {"ghost_landmarks": 2, "ghost_metres": 0.0}
+    found = boundary_errors(track, true)
+    assert (found["ghost_landmarks"], found["ghost_metres"]) == (2, 0.0)
 
 
 def test_ghost_curve_is_the_length_with_no_boundary_near() -> None:
     """20 m of curve over 10 m of truth: what is more than 2 m past its end has no boundary near."""
-    found = ghosts(Map(False, {LEFT: line(2.0, end=20.0)}), truth(row(2.0)))
+    found = boundary_errors(Map(False, {LEFT: line(2.0, end=20.0)}), truth(row(2.0)))
     assert found["ghost_metres"] == pytest.approx(8.0, abs=0.1)
     assert found["ghost_landmarks"] == 0
-    whole = ghosts(Map(False, {LEFT: line(2.0)}), truth(np.zeros((0, 2))))
+    whole = boundary_errors(Map(False, {LEFT: line(2.0)}), truth(np.zeros((0, 2))))
     assert whole["ghost_metres"] == pytest.approx(10.0)
 
 

@@ -13,13 +13,21 @@ from pathspace_graph.eval.metrics.alignment import (
     DIFFERENT,
     aligned_distance,
     differences,
+    end_by_registration,
     maps_apart,
     shape_rmse,
+    standing,
 )
 from pathspace_graph.factors.se2 import inverse, move_points, wrap_angle
+from pathspace_graph.front_end.front_end import measure_log, seen_cycles
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import NO_COVARIANCE, Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.sim.faults import Faults, OdometryFaults
+from pathspace_graph.sim.sensor import SensorSettings
+from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.track_generator import generate_track
+from pathspace_graph.sim.vehicle import VehicleSettings
 from pathspace_graph.spline.knots import fit_spline
 
 from ...scenes.drives import bean_track
@@ -41,7 +49,7 @@ def rows() -> dict[int, Array]:
 
 
 def curves(cones: dict[int, Array]) -> Map:
-    splines = {label: fit_spline(own, len(own), True) for label, own in cones.items()}
+    splines = {label: fit_spline(own, len(own), True)[0] for label, own in cones.items()}
     return Map(True, {label: SplineBoundary(one, np.eye(2 * one.size)) for label, one in splines.items()})
 
 
@@ -109,3 +117,39 @@ def test_a_bulge_is_told_with_its_place_length_and_distance() -> None:
     assert one.length == pytest.approx(2.0 * half, abs=1.5)
     off, place = f"{one.distance:.2f} m from the known map", f"at x = {one.x:.1f} m, y = {one.y:.1f} m"
     assert one.line == f"the left boundary is up to {off} on {one.length:.0f} m, {place}"
+
+
+# --- registration of the end of a drive ------------------------------------------------------------------
+
+
+def test_a_start_and_a_stop_that_the_odometry_misses_are_in_the_reference() -> None:
+    """The odometry misses 0.4 m of the start and goes on for 3 m after the stop."""
+    odometry = OdometryFaults(dead_band=1.5, false_travel=1.0, false_travel_time=3.0)
+    vehicle = VehicleSettings(rest=3.0, stand=5.0, overrun=8.0)
+    settings = SimulationSettings(
+        laps=1, vehicle=vehicle, sensor=SensorSettings(range_max=25.0), faults=Faults(odometry=odometry)
+    )
+    log = simulate(generate_track(np.random.default_rng(21)), settings, seed=4)
+    assert log.truth is not None
+    cycles, _ = seen_cycles(log)
+    noise = measure_log(log)
+    assert noise is not None
+    assert 20 < len(standing(cycles)) <= 55 and 20 < len(standing(cycles[::-1])) <= 35
+    true = log.truth.poses[-1]
+    reckoned = cycles[-1].pose
+    assert np.hypot(*(reckoned[:2] - true[:2])) > 1.0
+    found = end_by_registration(cycles, noise)
+    assert found is not None
+    np.testing.assert_allclose(found[:2], true[:2], atol=0.15)
+    assert found[2] == pytest.approx(true[2], abs=0.02)
+    moving = [one for one in cycles if one.detections.t > 4.0]
+    assert end_by_registration(moving, noise) is None
+    assert end_by_registration(cycles[:-60], noise) is None
+
+
+def test_without_common_cones_there_is_no_reference() -> None:
+    settings = SimulationSettings(laps=1, vehicle=VehicleSettings(rest=3.0, stand=5.0, overrun=-60.0))
+    log = simulate(generate_track(np.random.default_rng(21)), settings, seed=4)
+    noise = measure_log(log)
+    assert noise is not None
+    assert end_by_registration(seen_cycles(log)[0], noise) is None

@@ -13,14 +13,13 @@ from pathspace_graph.eval.metrics.measures import (
     WHOLE,
     Metric,
     closes_falsely,
-    covariance_bytes,
     map_bytes,
     measure,
     stage_times,
 )
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult, VehicleState
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 
@@ -104,7 +103,7 @@ def test_without_truth_only_what_needs_none_is_measured() -> None:
     lap, whole = measure(run(true), log(None))
     keys = {"size", "closed", "bytes", "bytes_covariance", "ms_mean", "ms_p99", "ms_processor"}
     keys |= {"lap"}
-    assert set(lap) == keys == set(whole) - {"closed_at_end", "crossings"}
+    assert set(lap) == keys == set(whole) - {"closed_at_end", "crossings", "crossings_own"}
     bare = log(Truth(true.pose_t, true.poses, np.zeros((0, 2)), np.zeros(0, dtype=int)))
     assert set(measure(run(true), bare)[0]) == keys | {"ate", "along", "across"}
 
@@ -200,22 +199,13 @@ def test_the_health_of_the_cycles_is_counted_where_it_is_told() -> None:
     assert (whole["reported_degraded"], whole["reported_lost"]) == (0.3, 0.2)
 
 
-def test_the_calibration_is_told_in_sigmas_of_its_prior() -> None:
-    true = circle_truth()
-    state = VehicleState(np.zeros(3), np.array([0.02, -0.001]), np.eye(5))
-    priors = {"odometry": {"sigma_scale": 0.005, "sigma_bias": 0.002}}
-    whole = measure(replace(run(true), vehicle=state, settings=priors), log(true))[-1]
-    assert (whole["scale_by_prior"], whole["bias_by_prior"]) == (pytest.approx(4.0), pytest.approx(-0.5))
-    assert "scale_by_prior" not in measure(replace(run(true), vehicle=state), log(true))[-1]
-
-
 def test_bytes_of_a_map() -> None:
     closed = BSpline.periodic_from(np.arange(9.0), np.random.default_rng(0).normal(size=(8, 2)))
     track = Map(True, {LEFT: SplineBoundary(closed, np.eye(16)), RIGHT: landmarks((0, 0), (1, 1), (2, 2))})
-    assert map_bytes(track) == 8 * (16 + 9 + 6)
-    assert covariance_bytes(track) == 8 * (16 * 17 // 2 + 6 * 7 // 2)
-    assert map_bytes(Map(False, {LEFT: line(0.0)})) == 8 * (8 + 8)
-    assert map_bytes(Map(False, {})) == covariance_bytes(Map(False, {})) == 0
+    covariance = 8 * (16 * 17 // 2 + 6 * 7 // 2)
+    assert map_bytes(track) == {"bytes": 8 * (16 + 9 + 6), "bytes_covariance": covariance}
+    assert map_bytes(Map(False, {LEFT: line(0.0)}))["bytes"] == 8 * (8 + 8)
+    assert map_bytes(Map(False, {})) == {"bytes": 0, "bytes_covariance": 0}
 
 
 def test_times_of_cycles_and_their_stages() -> None:

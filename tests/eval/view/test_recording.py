@@ -20,8 +20,6 @@ from pathspace_graph.eval.view.recording import (
     DISPLAYS,
     check_recording,
     dashes,
-    has_display,
-    pale,
     recording,
 )
 from pathspace_graph.io.log import Log
@@ -196,11 +194,6 @@ def test_dashes_are_every_other_piece() -> None:
     assert dashes(points[:1]) == dashes(points[:0]) == []
 
 
-def test_a_pale_colour_is_half_way_to_white() -> None:
-    assert pale("#000000") == "#808080"
-    assert pale("#ffffff") == "#ffffff"
-
-
 @pytest.fixture
 def log_folder(tmp_path: Path) -> Path:
     write_log(exact_log(ahead(8.0, 1.0), *corridor(30.0)), tmp_path / "log")
@@ -236,12 +229,6 @@ def test_without_a_display_no_window_is_tried(
     line = refused(capsys, log_folder, "--view")
     assert "--view: expected a display (DISPLAY or WAYLAND_DISPLAY), found none" in line
     assert "--save-view" in line
-
-
-def test_a_display_is_known_by_the_environment_on_linux_only() -> None:
-    assert has_display("darwin", {}) and has_display("win32", {})
-    assert not has_display("linux", {"DISPLAY": ""})
-    assert has_display("linux", {"DISPLAY": ":0"}) and has_display("linux", {"WAYLAND_DISPLAY": "wayland-0"})
 
 
 def test_a_viewer_that_does_not_start_is_told(

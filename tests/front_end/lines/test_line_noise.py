@@ -14,7 +14,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
-from pathspace_graph.sim.lines import LINE, LineSettings
+from pathspace_graph.sim.sensor import LINE, LineSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
