@@ -489,9 +489,9 @@ def match_stations(
         cones = cones_of_curve(state, first, label, settings)
         if len(cones.u) < ROW_CONES:
             return None
-        places[label] = feet_of_cones(state, cones, label).u
-    sigmas = {label: np.full(len(u), SIGMA_STATION) for label, u in places.items()}
-    stations = Stations.of(state, places, sigmas)
+        u = feet_of_cones(state, cones, label).u
+        places[label] = np.column_stack([u, np.full(len(u), SIGMA_STATION)])
+    stations = Stations.of(state, places)
     rows, station, sigma = [], [], []
     for curve in stations.curves:
         own = detections.used_on(curve.label)

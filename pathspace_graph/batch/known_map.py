@@ -13,7 +13,6 @@ from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.map import NO_CONES, Map, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.settings.mapper import MapperSettings, SplineSettings, known_settings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
@@ -82,12 +81,6 @@ class KnownMap:
             end = np.array([boundary.confirmed_end])
             boundary.add_cones(spline.evaluate(end), end)
         return boundary
-
-    def place_cones(self, track: CurveMap) -> None:
-        """Hand the cones to a map with the known curves; open curves keep weak priors, since they grow."""
-        places = {label: cones[:, 0] for label, cones in self.cones.items() if len(cones)}
-        stations = {label: cones.T for label, cones in self.cones.items()}
-        track.replaced_by({}, places, stations if len(places) == len(stations) else {}, self.closed)
 
 
 def map_of_cones(

@@ -81,10 +81,8 @@ class LapMarginal:
     information: Array  # (n, n) its information, the inverse of its covariance
     scatter: dict[int, Array]
     """(m,) sigma of each closed boundary's control points by the scatter of its cones (m)."""
-    cones: dict[int, Array]  # (k,) parameters of each closed boundary's detected cones on its curve (m)
-    stations: dict[int, Array]
-    """(2, k) parameters of stations along each closed curve, and sigmas of the cones along it, given the
-    curve (m); empty without stations."""
+    cones: dict[int, Array]
+    """(k, 2) cones of each closed curve: parameters, and sigmas along it, given the curve (m)."""
     seconds: float  # wall time (s)
     objection: str = ""  # evidence against the map; empty if there is none
 
@@ -99,10 +97,10 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
     with threadpool_limits(limits=1):
         system, at, convergence = lap_optimum(lap)
         prior = np.array(lap.settings.calibrations), np.array(lap.settings.sigmas_calibrations)
-        scatter, cones, stations = dict[int, Array](), dict[int, Array](), dict[int, Array]()
+        scatter, cones = dict[int, Array](), dict[int, Array]()
         if at.state.closed:
             simple = simplified(at.state, system.detections, system.settings)
-            few, change, cones = simple.state, simple.change, simple.scatter.places
+            few, change = simple.state, simple.change
             curves = few.boundaries.items()
             scatter = {label: simple.scatter.of_control_points(label, boundary) for label, boundary in curves}
             objection = evidence_against(system, at, few.splines, simple.detections)
@@ -112,7 +110,11 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             objection = disagreement(system, at.state.poses, calibration, earlier)
         information, mean, dense = marginal_of(system, at, few, change, lap.first_kept)
         if system.matches is not None:
-            stations = stations_on(few, system.matches, at.state, change, dense)
+            cones = stations_on(few, system.matches, at.state, change, dense)
+        elif at.state.closed:
+            sigma = lap.settings.spline.sigma_shape
+            places = simple.scatter.places.items()
+            cones = {label: np.column_stack([u, np.full(len(u), sigma)]) for label, u in places}
         return LapMarginal(
             convergence=convergence,
             splines=few.splines,
@@ -125,7 +127,6 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             information=information,
             scatter=scatter,
             cones=cones,
-            stations=stations,
             seconds=time.perf_counter() - begin,
             objection=objection,
         )
@@ -175,7 +176,7 @@ def marginal_of(
 def stations_on(
     few: State, matches: StationMatches, dense: State, change: Array, covariance: Array
 ) -> dict[int, Array]:
-    """Transfer stations of dense curves to curves with few knots: parameters and sigmas along, (2, k).
+    """Transfer stations of dense curves to curves with few knots: parameters and sigmas along, (k, 2).
 
     A cone is `S_dense(u)`. Given the few control points `F c` it moves by `(B_dense(u) - B_few(u') F) dc`,
     where u' is its foot point on the curve with few knots, B the basis, and dc has the given covariance.
@@ -189,7 +190,7 @@ def stations_on(
         F = change[map_block(few, label), block]
         along = along_of(old, u, foot.tangent_unit) - along_of(new, foot.u, foot.tangent_unit) @ F
         variance = np.einsum("kn,kn->k", along @ covariance[block, block], along)
-        found[label] = np.array([foot.u, np.sqrt(variance)])
+        found[label] = np.column_stack([foot.u, np.sqrt(variance)])
     return found
 
 

@@ -63,7 +63,7 @@ class Closed(Phase):
         notice = self.map_repair.end(solved)
         if solved is None or not notice:
             return Step(self)
-        jump = drive.swap_in(road, solved)
+        jump = drive.take(road, solved)
         self._boundaries_cross = _crosses(road, drive)
         self._settled = road.path.length
         return Step(self, jump, notice)

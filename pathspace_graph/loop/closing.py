@@ -1,6 +1,7 @@
-"""What replaces the map of an open road: the marginal of the lap's batch, or a known map; and its gauge."""
+"""The map of a road is replaced: by the marginal of a batch of the drive, or by a known map. Its gauge."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -9,14 +10,13 @@ from scipy.linalg import block_diag
 from pathspace_graph.batch.association import POSE_STEP, headings, locate_poses
 from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import LapMarginal
-from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.se2 import compose, inverse, left_of, move_points, relative
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.se2 import compose, inverse, left_of, move_points
 from pathspace_graph.graph.smoother import exchange_calibration_priors, hold_motion, restart, set_prior
-from pathspace_graph.graph.variables import control_keys, pose_keys
+from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import GivenFactor, State
-from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import SAME_DIRECTION, Boundary, open_boundary
 
 SIGMAS_CALIBRATIONS: Final = (0.05, 0.02, 0.03, 0.1, 0.05, 0.05, 0.2)
@@ -28,122 +28,131 @@ FIRST_REACH: Final = 20.0  # search range of foot points about that place (m alo
 SIGMA_STEP: Final = 10.0  # damping of control points while the loop is optimized (m)
 
 
-# --- the marginal of a batch -----------------------------------------------------------------------------
+# --- another map -----------------------------------------------------------------------------------------
 
 
-def swap_in(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor] = ()) -> Array:
-    """Replace curves and prior by the marginal of a lap; return the jump (3,) of the newest pose.
+@dataclass(frozen=True, eq=False)
+class NewMap:
+    """Curves, and the Gaussian of [calibration | control points, left first | pose] that is their prior."""
 
-    The window keeps its own factors of the poses from `first_kept` on, and the marginal has those of all
-    earlier poses, so nothing is counted twice. The marginal includes the priors of spacing and shape. Of the
-    factors that the user has `given`, later ones on former control points go on as rows.
+    curves: dict[int, tuple[Boundary, Array]]  # by label, with the control points (m, 2) in m, map frame
+    calibration: Array  # (2,) or (7,) calibration of odometry and sensor
+    known: dict[int, int]  # number of first control points of each curve that the prior holds
+    mean: Array  # (n,) mean of the prior
+    information: Array  # (n, n) inverse of its covariance
+    scatter: dict[int, Array] = field(default_factory=dict)  # as in `CurveMap.replaced_by`
+    cones: dict[int, Array] = field(default_factory=dict)
+    held_by_prior: bool = False  # whether the prior includes the weak priors of spacing and shape
+
+
+def replace_map(
+    road: Road, new: NewMap, poses: Array, cycle: int, given: Sequence[GivenFactor] = ()
+) -> Array:
+    """Replace curves, prior and window of a road; return the jump (3,) of the newest pose.
+
+    The window keeps the poses (P, 3) of its last cycles and their measurements; the prior is on the pose of
+    `cycle`. What is fixed to the vehicle moves with the newest pose: driven path, tentative and orange cones.
+    Curves on new knots locate the poses again. Of the factors that the user has `given`, the prior includes
+    those before the window, and the others on former control points become rows on the new ones.
     """
     smoother, state = road.smoother, road.smoother.map.state
-    restart(smoother, marginal.first_kept)
-    smoother.user_factors.drop([one.factor for one in given if one.cycle < marginal.first_kept or one.points])
-    before, removed = state.poses[-1].copy(), state.map_keys
-    settings = road.settings.spline, road.settings.gauge
-    for label, spline in marginal.splines.items():  # a batch may have found a side that the road has not
-        boundary = state.boundaries.get(label, open_boundary(*settings))
-        state.close(label, boundary.closed(spline.knots))
-    added = np.concatenate([state.control_keys(label) for label in marginal.splines])
-    points = np.concatenate([spline.distinct_control_points for spline in marginal.splines.values()])
-    smoother.variables.remove(removed)
-    smoother.variables.insert(added, points.ravel())
-    smoother.map.replaced_by(marginal.scatter, marginal.cones, marginal.stations)
-    _move_poses(state.poses, marginal.poses[marginal.first_kept :])
-    locate_poses(state)
-    _take_prior(smoother, marginal, added)
-    later = [one for one in given if one.cycle >= marginal.first_kept and one.points]
-    smoother.add_to_prior([rows for one in later for rows in one.on(state)])
-    smoother.reassociate()
-    return _jump(road, before)
-
-
-def lay_on(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor] = ()) -> Array:
-    """Move an open map to the marginal of its batch, the new prior; return the jump (3,) of the newest pose.
-
-    The curves keep their knots and go on to grow. What came after the batch's last pose moves rigidly with
-    it: poses, tentative cones, and the newest ends of the curves.
-    """
-    smoother, state = road.smoother, road.smoother.map.state
-    restart(smoother, marginal.first_kept)
-    smoother.user_factors.drop([one.factor for one in given if one.cycle < marginal.first_kept])
-    before = state.poses[-1].copy()
-    _move_poses(state.poses, marginal.poses[marginal.first_kept :])
-    motion = compose(state.poses[-1], inverse(before))
-    road.move(motion)
-    for label, spline in marginal.splines.items():
-        control_points, boundary = state.control_points(label), state.boundaries[label]
-        end, placed = marginal.ends[label], spline.size
-        if boundary.confirmed_end > end:  # growth has placed the last ones again
-            placed = boundary.settled(spline.size, boundary.last_cone(end))
-        control_points[placed:] = move_points(motion, control_points[placed:])
-        control_points[:placed] = spline.control_points[:placed]
-    known = [state.control_keys(label)[: spline.size] for label, spline in marginal.splines.items()]
-    _take_prior(smoother, marginal, np.concatenate(known))
-    exchange_calibration_priors(smoother, marginal.calibration_prior)
-    return _jump(road, before)
-
-
-def _move_poses(poses: Array, solved: Array) -> None:
-    """Set the first poses of the window (P, 3) to the solved ones (k, 3), and move the rest rigidly."""
-    last = poses[len(solved) - 1].copy()
-    for pose in poses[len(solved) :]:
-        pose[:] = compose(solved[-1], relative(last, pose))
-    poses[: len(solved)] = solved
-
-
-def _take_prior(smoother: CurveSmoother, marginal: LapMarginal, known: IntArray) -> None:
-    """Take the calibration and the prior of a marginal, whose control points have the keys `known` (k,)."""
-    variables = smoother.variables
-    variables.calibrations[:] = marginal.calibration
-    oldest = pose_keys(np.array([marginal.first_kept]))
-    keys = np.concatenate([variables.calibration_keys, known, oldest])
-    set_prior(smoother, keys, marginal.mean, marginal.information)
-
-
-def _jump(road: Road, before: Array) -> Array:
-    """Take the steps after a replacement; return the jump (3,) of the newest pose from that before."""
+    variables, before = state.variables, state.poses[-1].copy()
+    restart(smoother, smoother.next_cycle - len(poses))
+    smoother.user_factors.drop([one.factor for one in given if one.cycle < smoother.first_cycle])
+    road.move(compose(poses[-1], inverse(before)))
+    removed = state.map_keys
+    state.replace_curves({label: boundary for label, (boundary, _) in new.curves.items()})
+    are_new = len(np.setdiff1d(state.map_keys, removed)) > 0
+    smoother.user_factors.remove(np.setdiff1d(removed, state.map_keys), variables)
+    variables.remove(removed)
+    for label, (_, points) in sorted(new.curves.items()):
+        variables.insert(state.control_keys(label), points.ravel())
+    variables.calibrations[:] = new.calibration
+    state.poses[:] = poses
+    smoother.map.replaced_by(new.scatter, new.cones, new.held_by_prior)
+    if are_new:
+        locate_poses(state)
+        if not state.closed:
+            _locate_first(state)
+    held = [state.control_keys(label)[: new.known[label]] for label in state.boundaries]
+    keys = np.concatenate([variables.calibration_keys, *held, pose_keys(np.array([cycle]))])
+    set_prior(smoother, keys, new.mean, new.information)
+    if are_new:
+        later = [one for one in given if one.cycle >= smoother.first_cycle and one.points]
+        smoother.add_to_prior([rows for one in later for rows in one.on(state)])
+        smoother.reassociate()
     for _ in range(road.settings.closing.iterations):
-        road.smoother.step(SIGMA_STEP)
+        smoother.step(SIGMA_STEP)
     return np.asarray(road.poses[-1] - before)
 
 
-# --- a known map ----------------------------------------------------------------------------------------
+def take_marginal(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor] = ()) -> Array:
+    """Continue from the batch of a drive; return the jump (3,) of the newest pose.
 
-
-def lay_on_known(road: Road, known: KnownMap, motion: Array, covariance: Array) -> Array:
-    """Replace curves and prior of an open road by a known map; return the jump (3,) of the newest pose.
-
-    The motion (3,) moves the road onto the map; the covariance (3, 3) is of the newest pose, map frame.
+    The window keeps its own factors of the poses from `first_kept` on, and the marginal has those of all
+    earlier poses, so nothing is counted twice. Closed curves have few, new knots. Open ones keep their knots
+    and go on to grow; their ends that have grown since move with the vehicle.
     """
-    smoother, state = road.smoother, road.smoother.map.state
-    variables = state.variables
-    sigmas = np.array(SIGMAS_CALIBRATIONS)[: len(variables.calibrations)]
-    restart(smoother, smoother.first_cycle)
-    before, removed = state.poses[-1].copy(), state.map_keys
-    smoother.user_factors.remove(removed, variables)
-    road.move(motion)
+    smoother, state, settings = road.smoother, road.smoother.map.state, road.settings
+    smoother.transform_to_origin()
+    window = road.poses[marginal.first_kept - smoother.first_cycle :]
+    solved = marginal.poses[marginal.first_kept :]
+    motion = compose(solved[-1], inverse(window[len(solved) - 1]))
+    poses = np.concatenate([solved, compose(motion, window[len(solved) :])])
+    curves = dict[int, tuple[Boundary, Array]]()
+    for label, spline in marginal.splines.items():
+        points = spline.distinct_control_points
+        boundary = state.boundaries.get(label, open_boundary(settings.spline, settings.gauge))
+        if spline.periodic:  # a batch may have found a side that the road has not
+            curves[label] = boundary.closed(spline.knots), points
+            continue
+        placed, end = spline.size, marginal.ends[label]
+        if boundary.confirmed_end > end:  # growth has placed the last ones again
+            placed = boundary.settled(spline.size, boundary.last_cone(end))
+        grown = move_points(motion, state.control_points(label)[placed:])
+        curves[label] = boundary, np.concatenate([points[:placed], grown])
+    new = NewMap(
+        curves,
+        marginal.calibration,
+        {label: spline.size for label, spline in marginal.splines.items()},
+        marginal.mean,
+        marginal.information,
+        marginal.scatter,
+        marginal.cones,
+        held_by_prior=marginal.closed,
+    )
+    jump = replace_map(road, new, poses, marginal.first_kept, given)
+    exchange_calibration_priors(smoother, marginal.calibration_prior)
+    return jump
+
+
+def take_known(road: Road, known: KnownMap, pose: Array, covariance: Array) -> Array:
+    """Continue on a known map; return the jump (3,) of the newest pose, which was `pose` (3,) on that map.
+
+    The covariance (3, 3) is of the newest pose, map frame. The map keeps the weak priors where it grows.
+    """
+    road.smoother.transform_to_origin()
+    settings, state, boundaries = road.settings, road.smoother.map.state, road.boundaries
+    points = [spline.distinct_control_points for _, spline in sorted(known.splines.items())]
+    sigmas = np.array(SIGMAS_CALIBRATIONS)[: len(state.variables.calibrations)]
+    parts = np.diag(sigmas**2), known.covariance, covariance
+    curves = {}
+    for label, own in zip(sorted(known.splines), points, strict=True):
+        before = boundaries.get(label)
+        first = before.first + before.size if before else 0  # its control points have new keys
+        curves[label] = known.boundary(label, settings, first), own
+    new = NewMap(
+        curves,
+        state.variables.calibrations.copy(),
+        {label: len(own) for label, (_, own) in curves.items()},
+        np.concatenate([state.variables.calibrations, *(own.ravel() for own in points), pose]),
+        block_diag(*map(np.linalg.inv, parts)),
+        cones=known.cones,
+        held_by_prior=known.closed,
+    )
     road.growth.wait_for({} if known.closed else known.ends)
-    curves = {label: _next(state.boundaries, known, label, road.settings) for label in known.splines}
-    state.replace_curves(curves)
-    added = np.concatenate([control_keys(label, b.numbers) for label, b in state.boundaries.items()])
-    points = np.concatenate([spline.distinct_control_points for spline in known.splines.values()])
-    variables.remove(removed)
-    variables.insert(added, points.ravel())
-    known.place_cones(smoother.map)
-    state.poses[:] = compose(motion, state.poses)
-    locate_poses(state)
-    if not known.closed:
-        _locate_first(state)
-    keys = np.concatenate([variables.calibration_keys, added, pose_keys(smoother.cycles[-1:])])
-    mean = np.concatenate([variables.calibrations, points.ravel(), state.poses[-1]])
-    known_of = np.diag(sigmas**2), known.covariance, covariance
-    information = block_diag(*map(np.linalg.inv, known_of))
-    set_prior(smoother, keys, mean, information)
-    smoother.reassociate()
-    return _jump(road, before)
+    poses = compose(compose(pose, inverse(road.poses[-1])), road.poses)
+    return replace_map(road, new, poses, road.next_cycle - 1)
 
 
 def _locate_first(state: State) -> None:
@@ -159,12 +168,6 @@ def _locate_first(state: State) -> None:
         low = np.full(len(state.poses), max(first - FIRST_REACH, boundary.tables.low))
         found = boundary.find(points, state.poses[:, :2], low, low + 2.0 * FIRST_REACH)
         state.locate(label, np.maximum.accumulate(found.u))
-
-
-def _next(boundaries: dict[int, Boundary], known: KnownMap, label: int, settings: MapperSettings) -> Boundary:
-    """Return a known curve whose control points have new keys."""
-    before = boundaries.get(label)
-    return known.boundary(label, settings, before.first + before.size if before else 0)
 
 
 # --- the gauge -------------------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ from pathspace_graph.mapping.state import GivenFactor
 from pathspace_graph.places.passes import SeenIn
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .closing import lay_on, lay_on_known, swap_in
+from .closing import take_known, take_marginal
 from .known_loop import evidence_of
 from .lap_solver import LapSolver, Outcome
 
@@ -256,39 +256,30 @@ class Drive(Copyable):
         smoother = road.smoother
         return self.solver.outcome(road.next_cycle - 1, smoother.times, smoother.first_cycle, spent)
 
-    def close(self, road: Road, solved: LapMarginal, returned_by: Revisit) -> Array:
-        """Close the loop of an open road by the batch of a return; return the jump (3,)."""
-        self.closed_by = returned_by
-        return self.swap_in(road, solved)
-
-    def swap_in(self, road: Road, solved: LapMarginal) -> Array:
-        """Replace map and prior of a road by those of a lap; return the jump (3,) of the newest pose."""
+    def take(self, road: Road, solved: LapMarginal) -> Array:
+        """Replace the map by that of a batch of the drive; return the jump (3,) of the newest pose."""
         self.record.linearize(road)
-        return self._replaced(road, solved, swap_in(road, solved, self.record.factors))
-
-    def lay_on(self, road: Road, solved: LapMarginal, revisit: Revisit) -> Array:
-        """Move an open map to the batch of a revisit; return the jump (3,) of the newest pose."""
-        self.revisits = (*self.revisits, revisit)
-        return self._replaced(road, solved, lay_on(road, solved, self.record.factors))
-
-    def _replaced(self, road: Road, solved: LapMarginal, jump: Array) -> Array:
+        jump = take_marginal(road, solved, self.record.factors)
         self.lap_seconds = solved.seconds
-        self.record.replaced(np.concatenate([solved.poses[: solved.first_kept], road.poses]))
-        road.orange.place(0, self.record.corrected)
+        self._replaced(road, solved.poses[: solved.first_kept])
         return jump
 
-    def lay_on_known(self, road: Road, known: KnownMap, pose: Array, covariance: Array) -> Array:
+    def take_known(self, road: Road, known: KnownMap, pose: Array, covariance: Array) -> Array:
         """Replace an open road by the known map on which the newest pose (3,) lies; return the jump (3,)."""
         motion = compose(pose, inverse(road.poses[-1]))
         earlier = compose(motion, self.record.with_window(road)[: road.smoother.first_cycle])
         self.solver.give_up(road.next_cycle)
-        jump = lay_on_known(road, known, motion, covariance)
-        self.record.replaced(np.concatenate([earlier, road.poses]))
+        jump = take_known(road, known, pose, covariance)
+        self._replaced(road, earlier)
         self.record.give_up(KNOWN)
         self.placed_at, self.keeps_map = road.smoother.times[-1], known.kept
-        road.orange.place(0, self.record.corrected)
         self.monitor.restart()
         return jump
+
+    def _replaced(self, road: Road, earlier: Array) -> None:
+        """Record the poses (k, 3) of the cycles before the window of a road with another map."""
+        self.record.replaced(np.concatenate([earlier, road.poses]))
+        road.orange.place(0, self.record.corrected)
 
 
 @dataclass(frozen=True, eq=False)

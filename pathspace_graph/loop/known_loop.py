@@ -15,6 +15,7 @@ from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.gaussian import half_solve
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.health import SHARE_DEGRADED, Evidence
+from pathspace_graph.io.map import NO_CONES
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
@@ -94,7 +95,7 @@ def lay_out_loop(track: CurveMap) -> Loop:
         u = np.arange(boundary.tables.low, boundary.tables.high, SAMPLE)
         curves[label] = KDTree(boundary.evaluate(track.state.control_points(label), u))
         begins[label] = boundary.tables.low
-        cones = track.cones.get(label, np.zeros(0))
+        cones = track.cones.get(label, NO_CONES)[:, 0]
         mapped[label] = is_mapped(u, cones, boundary.length, GAP_RATIO, margin)
     return Loop(curves, mapped, begins)
 

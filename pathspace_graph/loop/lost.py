@@ -85,9 +85,8 @@ class Lost(Phase):
         """Start when the vehicle on a closed map becomes lost, with the health that says why."""
         self.closed = closed  # phase of a vehicle that is found
         road.smoother.refresh()
-        track, cones = road.smoother.map, dict[int, Array]()
-        if not road.settings.of_lines:
-            cones = {label: np.column_stack([u, np.zeros(len(u))]) for label, u in track.cones.items()}
+        track = road.smoother.map
+        cones = None if road.settings.of_lines else track.cones
         self.search = Search(road, KnownRoad.of(track.state.splines, cones))
         self._health = health
 

@@ -19,6 +19,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.front_end.cone_rows import ROW_GAP
 from pathspace_graph.graph.smoother import place_again
+from pathspace_graph.io.map import NO_CONES
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import along_and_across
@@ -239,7 +240,9 @@ def refitted(track: CurveMap, label: int, stretches: list[ContradictedStretch], 
 def mapped_cones(track: CurveMap, label: int) -> Array:
     """Return the cones (k, 2) on the curve of a boundary, or points at regular distances on a line."""
     boundary, spacing = track.state.boundaries[label], track.settings.spline.spacing
-    u = track.cones.get(label, np.arange(boundary.tables.low, boundary.tables.high, spacing))
+    u = track.cones.get(label, NO_CONES)[:, 0]
+    if len(u) == 0:
+        u = np.arange(boundary.tables.low, boundary.tables.high, spacing)
     return boundary.evaluate(track.state.control_points(label), u)
 
 

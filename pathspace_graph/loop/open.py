@@ -112,12 +112,14 @@ class Open(Phase):
         assert self.asked_by is not None
         if self._closes:
             road.smoother.settle()
-            jump = drive.close(road, outcome, self.asked_by)
+            drive.closed_by = self.asked_by
+            jump = drive.take(road, outcome)
             return Step(self.CLOSED(road, drive), jump)
         if road.growth.taken_back > self._taken_back:
             return Step(self, notice=f"{failed}: a curve was taken back")
         notice = "" if drive.revisits else REVISITED  # only the first time
-        return Step(self, drive.lay_on(road, outcome, self.asked_by), notice)
+        drive.revisits = (*drive.revisits, self.asked_by)
+        return Step(self, drive.take(road, outcome), notice)
 
 
 def open_map(road: Road, poses: Array) -> StartMap:

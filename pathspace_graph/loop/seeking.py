@@ -54,7 +54,7 @@ class Seeking(Phase):
         place = None if drive.rests(road) or self._search is None else self._search.find()
         if place is None:
             return Step(self, step.jump, step.notice, step.health)
-        jump = drive.lay_on_known(road, self.known, place.pose, widened(place))
+        jump = drive.take_known(road, self.known, place.pose, widened(place))
         phase = Closed(road, drive) if self.known.closed else OnOpenMap()
         return Step(phase, jump, "; ".join(filter(None, [step.notice, PLACED])), Health(DEGRADED, PLACED))
 

@@ -12,6 +12,7 @@ from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.factors.residuals import pair_residuals, sigma_across
 from pathspace_graph.graph.rows import Rows, stacked_rows
 from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, control_keys
+from pathspace_graph.io.map import NO_CONES
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .detection_rows import SIGMA_POSE, Stations
@@ -31,7 +32,7 @@ class CurveMap:
         self.detections = DetectionTable()  # detections of the poses in the window
         self.held_by_prior = False  # whether the prior determines the curves' spacing and shape
         self.scatter: dict[int, Array] = {}  # (m,) sigma of cones at each control point, if known (m)
-        self.cones: dict[int, Array] = {}  # (k,) parameters of the cones of a closed boundary (m), if known
+        self.cones: dict[int, Array] = {}  # (k, 2) cones of a boundary, if known: parameters, and sigmas (m)
         self.stations: Stations | None = None  # these cones, if they constrain detections along the curves
         self.reached_inactive = False  # whether the latest `rows` reach inactive control points
         self._refined: tuple[IntArray, Array] = (np.zeros(0, np.intp), np.zeros(0))
@@ -122,44 +123,26 @@ class CurveMap:
         self.state.drop_oldest_pose_u()
 
     def replaced_by(
-        self,
-        scatter: dict[int, Array],
-        cones: dict[int, Array],
-        stations: dict[int, Array],
-        held_by_prior: bool = True,
+        self, scatter: dict[int, Array], cones: dict[int, Array], held_by_prior: bool = True
     ) -> None:
-        """Take over the scatter and places of cones, by label, from the batch that made curves and prior.
+        """Take over the scatter and the cones, by label, from the batch that made curves and prior.
 
-        Stations (2, k) are parameters of cones and their standard deviations along the curves (m), if any.
+        Cones (k, 2) are their parameters and standard deviations along the curves (m).
         """
         self.held_by_prior, self.scatter, self.cones = held_by_prior, scatter, cones
-        self.stations = None
-        if stations:
-            u, sigma = ({label: own[k] for label, own in stations.items()} for k in (0, 1))
-            self.stations = Stations.of(self.state, u, sigma)
+        self.lay_out_stations()
 
-    def lay_stations_out(self) -> None:
-        """Rebuild the stations: growth of an open curve moves control points to other rows."""
-        if self.stations is None:
-            return
-        u = {curve.label: curve.u for curve in self.stations.curves}
-        sigma = {curve.label: curve.sigma for curve in self.stations.curves}
-        self.stations = Stations.of(self.state, u, sigma)
-
-    def placed_cones(self, label: int) -> Array:
-        """Stations (k, 2) of a curve: parameters and sigmas along it (m)."""
-        curves = self.stations.curves if self.stations is not None else ()
-        found = [np.column_stack([curve.u, curve.sigma]) for curve in curves if curve.label == label]
-        return np.concatenate([np.zeros((0, 2)), *found])
+    def lay_out_stations(self) -> None:
+        """Make the cones stations on the present curves, if all curves have some."""
+        labels = [*self.state.boundaries] if self.settings.stations else []
+        known = labels and all(len(self.cones.get(label, ())) for label in labels)
+        self.stations = Stations.of(self.state, self.cones) if known else None
 
     def forget_cones(self, label: int, is_gone: Callable[[Array], BoolArray]) -> None:
-        """Remove the cones of a closed curve that are gone, by their parameters (k,)."""
-        placed = {b: self.placed_cones(b) for b in self.state.boundaries}
-        placed[label] = placed[label][~is_gone(placed[label][:, 0])]
-        places = {b: cones[~is_gone(cones)] if b == label else cones for b, cones in self.cones.items()}
-        are_placed = all(map(len, placed.values()))
-        stations = {b: cones.T for b, cones in placed.items()} if are_placed else {}
-        self.replaced_by(self.scatter, places, stations)
+        """Remove the cones of a curve that are gone, by their parameters (k,)."""
+        own = self.cones.get(label, NO_CONES)
+        self.cones = {**self.cones, label: own[~is_gone(own[:, 0])]}
+        self.lay_out_stations()
 
     def match(self, rows: IntArray, directions: Array) -> None:
         """Match newly used detections (m,) with the stations of a closed map.

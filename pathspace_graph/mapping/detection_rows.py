@@ -153,12 +153,13 @@ class Stations:
     columns: IntArray  # (k, p + 1) control points that they weigh, by row of `State.map_points`
 
     @classmethod
-    def of(cls, state: State, u: Mapping[int, Array], sigma: Mapping[int, Array]) -> Self:
-        """Place cones at parameters (k,) of curves, at least one on each; both mappings are by label."""
+    def of(cls, state: State, cones: Mapping[int, Array]) -> Self:
+        """Place cones (k, 2), at least one on each curve, by label: parameters, and sigmas along it (m)."""
         curves, columns, values, before, count = list[CurveStations](), [], [], 0, 0
         for label, boundary in state.boundaries.items():
             ends = boundary.tables.low, boundary.tables.high if boundary.periodic else np.inf
-            own = CurveStations.of(label, count, u[label], sigma[label], ends)
+            u, sigma = cones[label].T
+            own = CurveStations.of(label, count, u, sigma, ends)
             value, span = boundary.tables.evaluate(own.u, 1)
             curves.append(own)
             columns.append(before + boundary.columns(span))

@@ -99,7 +99,7 @@ class Road:
             path_ahead = self.path.ahead(self.poses[-1], self.settings.growth.reach)
             self.grown, notice = self.growth.expand(self.smoother, path_ahead)
             if self.grown:
-                self.smoother.map.lay_stations_out()
+                self.smoother.map.lay_out_stations()  # control points are on other rows
         self.smoother.deactivate_distant()
         return notice
 

@@ -237,10 +237,6 @@ class State:
         self.variables.remove(self.control_keys(label))
         self.add_boundary(label, boundary, control_points)
 
-    def close(self, label: int, boundary: Boundary) -> None:
-        """Replace an open boundary by a periodic one; the smoother inserts its control points."""
-        self.boundaries = dict(sorted({**self.boundaries, label: boundary}.items()))
-
     def replace_curves(self, boundaries: Mapping[int, Boundary]) -> None:
         """Replace all boundaries; the smoother inserts their control points."""
         self.boundaries = dict(sorted(boundaries.items()))

@@ -13,7 +13,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.graph.variables import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
-from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
+from pathspace_graph.io.map import NO_CONES, NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import LapBatches, VehicleState
 from pathspace_graph.loop.drive import Drive, Phase
 from pathspace_graph.loop.lost import Lost
@@ -251,9 +251,10 @@ def _map_of(road: Road, sigma_size: float) -> Map:
         blocks = [slice(*ends) for ends in pairwise([0, *(POINT * np.cumsum(sizes)).tolist()])]
     else:
         joint, blocks = joint_covariance_of(list(outlooks.values()), joint, road.poses[-1])
+    cones = {} if road.settings.of_lines else track.cones
     boundaries = {
         label: SplineBoundary(
-            outlook.spline, joint[block, block], outlook.confirmed_until, track.placed_cones(label)
+            outlook.spline, joint[block, block], outlook.confirmed_until, cones.get(label, NO_CONES)
         )
         for (label, outlook), block in zip(outlooks.items(), blocks, strict=True)
     }

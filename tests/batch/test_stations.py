@@ -111,12 +111,12 @@ def test_a_station_s_sigma_is_how_it_moves_along_the_few_curve() -> None:
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(dense)), dense, 2000)
     for curve in system.matches.stations.curves:
         label, old, new = curve.label, at.state.boundaries[curve.label], few.boundaries[curve.label]
-        t = new.evaluate(few.control_points(label), stations[label][0], 1)
+        t = new.evaluate(few.control_points(label), stations[label][:, 0], 1)
         t /= np.hypot(*t.T)[:, None]
         mine = draws[:, map_block(at.state, label)]
         moved_few = mine @ change[map_block(few, label), map_block(at.state, label)].T
-        along = mine @ along_of(old, curve.u, t).T - moved_few @ along_of(new, stations[label][0], t).T
-        np.testing.assert_allclose(along.std(axis=0), stations[label][1], rtol=0.1)
+        along = mine @ along_of(old, curve.u, t).T - moved_few @ along_of(new, stations[label][:, 0], t).T
+        np.testing.assert_allclose(along.std(axis=0), stations[label][:, 1], rtol=0.1)
 
 
 def test_a_setting_leaves_the_pure_projection() -> None:

@@ -170,8 +170,7 @@ def test_a_wrong_colour_says_nothing_about_the_vehicle() -> None:
 def known_road(has_cones: bool) -> KnownRoad:
     """The map of a clean drive, with its cones or without."""
     track = clean()[1].road.smoother.map
-    cones = {label: np.column_stack([u, np.zeros(len(u))]) for label, u in track.cones.items()}
-    return KnownRoad.of(track.state.splines, cones if has_cones else None)
+    return KnownRoad.of(track.state.splines, track.cones if has_cones else None)
 
 
 def searched(has_cones: bool, away: Array, cycles: slice) -> list[Place | None]:

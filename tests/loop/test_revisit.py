@@ -161,10 +161,10 @@ class Replaced:
 @cache
 def replaced() -> list[Replaced]:
     """Return the replacements of a drive, without the steps that follow each."""
-    found, take = list[Replaced](), drive_module.lay_on
+    found, take = list[Replaced](), drive_module.take_marginal
     """The priors of the calibrations have changed since each batch began."""
 
-    def lay_on(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor]) -> Array:
+    def take_marginal(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor]) -> Array:
         before, after = road.copy(), road.copy()
         before.smoother.transform_to_origin()
         mean, sigma = after.smoother.calibration_prior
@@ -175,7 +175,7 @@ def replaced() -> list[Replaced]:
         return take(road, marginal, given)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drive_module, "lay_on", lay_on)
+        patch.setattr(drive_module, "take_marginal", take_marginal)
         map_log(drive())
     assert len(found) >= 3
     return found

@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.gtsam_factors import boundary_point_factor
-from pathspace_graph.factors.se2 import left_of, relative, wrap_angle
+from pathspace_graph.factors.se2 import left_of, wrap_angle
 from pathspace_graph.graph.gaussian import normal_equations
 from pathspace_graph.graph.variables import CALIBRATION_KEY, Layout, Variables, pose_keys
 from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import drive as drives
 from pathspace_graph.loop import worker
-from pathspace_graph.loop.closing import _move_poses
 from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.loop.open import STAYS_OPEN
 from pathspace_graph.mapping.road import HELD, Road
@@ -149,9 +148,9 @@ def swapped() -> tuple[Swap, OpenLap]:
     swaps: list[Swap] = []
     laps: list[OpenLap] = []
     calibrations: list[Array] = []
-    take, record, associate = drives.swap_in, DriveRecord.lap, CurveSmoother.reassociate
+    take, record, associate = drives.take_marginal, DriveRecord.lap, CurveSmoother.reassociate
 
-    def swap_in(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor]) -> Array:
+    def take_marginal(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor]) -> Array:
         jump = take(road, marginal, given)
         swaps.append(swap_of(road.smoother, marginal, calibrations[-1]))
         return jump
@@ -165,7 +164,7 @@ def swapped() -> tuple[Swap, OpenLap]:
         return laps[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drives, "swap_in", swap_in)
+        patch.setattr(drives, "take_marginal", take_marginal)
         patch.setattr(DriveRecord, "lap", lap)
         patch.setattr(CurveSmoother, "reassociate", reassociate)
         mapper, known = open_lap()
@@ -207,16 +206,6 @@ def test_the_window_has_every_measurement_once() -> None:
     scale = np.sqrt(np.diagonal(expected))
     assert np.abs((swap.covariance - expected) / np.outer(scale, scale)).max() < 1e-8
     assert np.abs(expected @ negative_gradient / scale).max() < 0.05
-
-
-def test_poses_of_the_lap_are_the_solved_ones_and_later_ones_move_with_the_last() -> None:
-    rng = np.random.default_rng(0)
-    poses, solved = rng.normal(size=(5, 3)), rng.normal(size=(3, 3))
-    before = poses.copy()
-    _move_poses(poses, solved)
-    np.testing.assert_array_equal(poses[:3], solved)
-    for k in (3, 4):
-        np.testing.assert_allclose(relative(solved[2], poses[k]), relative(before[2], before[k]), atol=1e-12)
 
 
 def test_poses_are_held_until_the_swap_where_the_window_empties_faster() -> None:

@@ -137,8 +137,8 @@ def test_a_side_that_only_a_batch_has_found_closes_as_well() -> None:
     """Curves stay in the order of their labels, as their control points are."""
     settings, state = MapperSettings(), State()
     knots = np.arange(-3.0, 14.0)
-    for label in (RIGHT, LEFT):
-        state.close(label, open_boundary(settings.spline, settings.gauge).closed(knots))
+    closed = open_boundary(settings.spline, settings.gauge).closed(knots)
+    state.replace_curves({RIGHT: closed, LEFT: closed})
     assert [*state.boundaries] == [LEFT, RIGHT]
     assert state.closed
 

@@ -68,8 +68,8 @@ def test_all_curves_are_numbered_together() -> None:
     """Cones of two rings, given in no order: their points are those of the curves, in ascending order."""
     state = state_of({LEFT: ring(8.0), RIGHT: ring(12.0)}, np.zeros((3, 3)), periodic=True)
     length = {label: boundary.length for label, boundary in state.boundaries.items()}
-    u = {LEFT: np.array([20.0, 5.0, 5.0 + length[LEFT]]), RIGHT: np.array([30.0, 1.0])}
-    found = Stations.of(state, u, {LEFT: np.array([0.3, 0.1, 0.2]), RIGHT: np.array([0.5, 0.4])})
+    left = np.array([[20.0, 0.3], [5.0, 0.1], [5.0 + length[LEFT], 0.2]])
+    found = Stations.of(state, {LEFT: left, RIGHT: np.array([[30.0, 0.5], [1.0, 0.4]])})
     assert found.label.tolist() == [LEFT] * 3 + [RIGHT] * 2
     assert [curve.first for curve in found.curves] == [0, 3]
     np.testing.assert_allclose(found.sigma, [0.1, 0.2, 0.3, 0.4, 0.5])
