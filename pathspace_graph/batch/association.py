@@ -16,8 +16,8 @@ from pathspace_graph.factors.residuals import sigma_across
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.graph.variables import Drives, Variables, pose_keys
 from pathspace_graph.labels import UNKNOWN
-from pathspace_graph.mapping.detection_rows import SIGMA_POSE, Stations
-from pathspace_graph.mapping.detections import NO_STATION, DetectionTable
+from pathspace_graph.mapping.detection_rows import CurveStations, Stations
+from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.path import LATERAL_GAP, ROW_BESIDE, SIDES, in_front_row
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tracks import nearest_within
@@ -455,26 +455,8 @@ SIGMA_STATION: Final = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class StationMatches:
-    """The stations of a batch's closed curves, and their unambiguous detections."""
-
-    stations: Stations
-    rows: IntArray  # (m,) detections, by row of the table
-    station: IntArray  # (m,) station of each
-    sigma: Array  # (m,) standard deviations along the curve, of detection and station (m)
-
-    def used(self, detections: DetectionTable) -> tuple[IntArray, IntArray, Array]:
-        """Return rows, stations and sigmas (k,) of detections in use on the boundary of their station."""
-        on_boundary = detections.boundary[self.rows] == self.stations.label[self.station]
-        chosen = detections.used[self.rows] & on_boundary
-        return self.rows[chosen], self.station[chosen], self.sigma[chosen]
-
-
-def match_stations(
-    state: State, detections: DetectionTable, settings: MapperSettings
-) -> StationMatches | None:
-    """Match all detections to stations of closed curves, the cones of the first drive's first lap.
+def cone_stations(state: State, detections: DetectionTable, settings: MapperSettings) -> Stations | None:
+    """Stations of closed curves: the cones of the first drive's first lap, and later ones in its gaps.
 
     None if a curve has too few cones, or detections are of lines. A lap misses its beginning by some
     decimetres, which would smear the cones of both ends and match a later lap to neighbours. So the first lap
@@ -483,27 +465,19 @@ def match_stations(
     if settings.of_lines:
         return None
     places = {}
-    for label in state.boundaries:
+    for label, boundary in state.boundaries.items():
         laps = laps_of_detections(state, detections, label)
         first = detections.where(np.flatnonzero(laps <= 0)).of_drive(0)
         cones = cones_of_curve(state, first, label, settings)
         if len(cones.u) < ROW_CONES:
             return None
         u = feet_of_cones(state, cones, label).u
+        later = feet_of_cones(state, cones_of_curve(state, detections, label, settings), label).u
+        low, high = boundary.tables.low, boundary.tables.high
+        known = CurveStations.of(label, 0, u, np.zeros(len(u)), (low, high))
+        u = np.append(u, later[np.abs(known.nearest(later)[1]) > np.median(known.apart)])
         places[label] = np.column_stack([u, np.full(len(u), SIGMA_STATION)])
-    stations = Stations.of(state, places)
-    rows, station, sigma = [], [], []
-    for curve in stations.curves:
-        own = detections.used_on(curve.label)
-        own = own[detections.label[own] == curve.label]
-        u, poses = detections.u[own], state.variables.poses_at(detections.cycle[own])
-        tangent = state.spline(curve.label).tangent_unit(u)
-        along = sigma_across(tangent, detections.covariance[own], poses, 0.0)
-        match = curve.matched(u, np.hypot(along, SIGMA_POSE))
-        rows.append(own[match != NO_STATION])
-        station.append(match[match != NO_STATION])
-        sigma.append(np.hypot(along, SIGMA_STATION)[match != NO_STATION])
-    return StationMatches(stations, *map(np.concatenate, (rows, station, sigma)))
+    return Stations.of(state, places)
 
 
 def laps_of_detections(state: State, detections: DetectionTable, label: int) -> IntArray:

@@ -106,11 +106,11 @@ def _across(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.Custo
 
 def _along(system: BatchSystem, at: Evaluation, label: int) -> list[gtsam.CustomFactor]:
     """Build a factor for each cycle, with its used detections at stations of a boundary."""
-    if system.matches is None:
+    if system.stations is None:
         return []
     chosen, measured = _measured(system, at, at.along, label)
-    station = system.matches.used(system.detections)[1][chosen]
-    u, sigma_station = system.matches.stations.u[station], np.zeros(len(station))
+    station = system.detections.station[at.along.rows[chosen]]
+    u, sigma_station = system.stations.u[station], np.zeros(len(station))
     return station_factors(u=u, sigma_station=sigma_station, **measured)
 
 

@@ -26,6 +26,7 @@ from pathspace_graph.graph.elimination import marginal_before
 from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.mapping.detection_rows import Stations
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import SAMPLE, GivenFactor, State
 from pathspace_graph.settings.mapper import MapperSettings
@@ -38,7 +39,6 @@ from pathspace_graph.spline.boundary import (
 )
 from pathspace_graph.spline.bspline import BSpline
 
-from .association import StationMatches
 from .optimizer import Convergence, Effort, Optimizer, Stage
 from .simplification import map_block, own_settings, simplified
 from .start import StartMap, aligned_odometry, start_odometry
@@ -109,8 +109,8 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             calibration, earlier = at.state.variables.calibration, lap.revisits[1:]
             objection = disagreement(system, at.state.poses, calibration, earlier)
         information, mean, dense = marginal_of(system, at, few, change, lap.first_kept)
-        if system.matches is not None:
-            cones = stations_on(few, system.matches, at.state, change, dense)
+        if system.stations is not None:
+            cones = stations_on(few, system.stations, at.state, change, dense)
         elif at.state.closed:
             sigma = lap.settings.spline.sigma_shape
             places = simple.scatter.places.items()
@@ -174,7 +174,7 @@ def marginal_of(
 
 
 def stations_on(
-    few: State, matches: StationMatches, dense: State, change: Array, covariance: Array
+    few: State, stations: Stations, dense: State, change: Array, covariance: Array
 ) -> dict[int, Array]:
     """Transfer stations of dense curves to curves with few knots: parameters and sigmas along, (k, 2).
 
@@ -182,7 +182,7 @@ def stations_on(
     where u' is its foot point on the curve with few knots, B the basis, and dc has the given covariance.
     """
     found = {}
-    for curve in matches.stations.curves:
+    for curve in stations.curves:
         label, u = curve.label, curve.u
         old, new, new_points = dense.boundaries[label], few.boundaries[label], few.control_points(label)
         foot = new.find_anywhere(new_points, old.evaluate(dense.control_points(label), u))

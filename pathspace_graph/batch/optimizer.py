@@ -13,12 +13,11 @@ from pathspace_graph.front_end.log_odometry import half_square
 from pathspace_graph.graph.elimination import Damping, linear_graph, solution
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import Layout
-from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.state import State
 
-from .association import associate, locate_poses
+from .association import locate_poses
 from .simplification import reknot
-from .system import LOOSE_GATE, BatchSystem, Biweight, Evaluation, moved
+from .system import LOOSE_GATE, BatchSystem, Evaluation, moved
 
 GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
 CHANGED_SHARE: Final = 1e-3  # largest share of detections that change in the last round of associations
@@ -82,25 +81,21 @@ class Optimizer:
         return at, convergence
 
     def schedule(self, state: State) -> list[Stage]:
-        """Stages of the search; on closed curves, stations constrain the detections along them.
-
-        The last stage matches again: more cones are unambiguous by then.
-        """
+        """Stages of the search; on closed curves, stations constrain the detections along them at the end."""
         gate, rounds, rough = self.settings.gate, self.effort.rounds, self.effort.tolerance * ROUGH_TOLERANCE
         first_gate = gate if self.system.revisits else LOOSE_GATE
         first = Stage(first_gate, self.effort.rough_rounds, rough, refit=True)
         curves = state.boundaries.values()
-        if not (self.system.settings.stations and curves and all(curve.periodic for curve in curves)):
-            return [first, Stage(gate, rounds, self.effort.tolerance, refit=True)]
-        second = Stage(gate, rounds, rough, refit=True, stations=True)
-        return [first, second, Stage(gate, rounds, self.effort.tolerance, stations=True)]
+        closed = bool(curves) and all(curve.periodic for curve in curves)
+        stations = self.system.settings.stations and closed
+        return [first, Stage(gate, rounds, self.effort.tolerance, refit=True, stations=stations)]
 
     def align_poses(self, state: State, gate: float) -> State:
         """Take one Gauss-Newton step of the poses alone, with fixed map and calibration."""
         self.system.begin(state)
         locate_poses(state)
-        at, _ = self._refreshed(state, gate, False)
-        return moved(state, self.system.poses_alone(at))
+        self.system.associate(state, gate, strict=False)
+        return moved(state, self.system.poses_alone(self.system.evaluate(state, hold=True)))
 
     def run(self, state: State, stage: Stage) -> tuple[Evaluation, Convergence]:
         """Optimize in rounds until a step is short, and return the problem after it.
@@ -122,7 +117,8 @@ class Optimizer:
             if searching:
                 if not strict and done > 1:
                     locate_poses(state)
-                at, changed = self._refreshed(state, gate, strict)
+                changed = system.associate(state, gate, strict)
+                at = system.evaluate(state, hold=True)
                 settled = changed <= CHANGED_SHARE * len(system.detections) or done > rounds // 2
                 searching = not (strict and settled)
             at, decrease = self._step(at, tolerance)
@@ -138,20 +134,6 @@ class Optimizer:
             decrease = predicted_decrease(rows, variables.layout, undamped)
         norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
         return at, Convergence(converged, reason, done, self.steps, at.cost, norm)
-
-    def _refreshed(self, state: State, gate: float, strict: bool) -> tuple[Evaluation, int]:
-        """Return the problem with new associations and sigmas, and the number of changed associations.
-
-        Its foot points have converged; otherwise the cost would change without a step.
-        """
-        system, detections = self.system, self.system.detections
-        before = np.where(detections.used, detections.boundary, UNKNOWN)
-        system.kernel = Biweight(gate)
-        detections.correct(state.variables.sensor)
-        associate(state, detections, system.settings, gate, strict)
-        system.settle(state)
-        changed = np.where(detections.used, detections.boundary, UNKNOWN) != before
-        return system.evaluate(state, hold=True), int(changed.sum())
 
     def _keep_foot_points(self, at: Evaluation) -> None:
         """Let later evaluations refine the foot points from their present places."""

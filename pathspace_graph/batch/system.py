@@ -19,13 +19,14 @@ from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph
 from pathspace_graph.graph.rows import Revisit, Rows, at_values, by_widths, revisit_rows
 from pathspace_graph.graph.variables import POINT, Layout, are_poses, of_sensor, pose_keys
 from pathspace_graph.graph.window import check_keys, check_linear, user_rows
+from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.curve_map import CurveMap
-from pathspace_graph.mapping.detection_rows import NO_ROWS, DetectionRows, rows_across
-from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.detection_rows import NO_ROWS, DetectionRows, Stations, rows_across
+from pathspace_graph.mapping.detections import NO_STATION, DetectionTable
 from pathspace_graph.mapping.state import GivenFactor, State
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .association import DIRECTION_PENALTY, StationMatches, headings, match_stations, nearest_by
+from .association import DIRECTION_PENALTY, associate, cone_stations, headings, nearest_by
 
 LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
 SETTLE_FEET: Final = 16  # largest number of refinements of the foot points before a step
@@ -176,8 +177,8 @@ class BatchSystem:
         self._given_rows: list[Rows] = []  # the user's factors of an online drive, at values of zero
         self.kernel = Biweight(LOOSE_GATE)
         self.gauges: dict[int, CurveGauge] = {}  # of each boundary
-        self.matches: StationMatches | None = None  # stations of closed curves, if they are used
-        self._sigma = np.ones(len(detections))  # across the curves, of this round (m)
+        self.stations: Stations | None = None  # stations of closed curves, if they are used
+        self._sigma = np.ones((2, len(detections)))  # across and along the curves, of this round (m)
 
     def widen_priors(self, drive: int, settings: MapperSettings) -> None:
         """Take the priors of a drive's calibrations from other settings."""
@@ -188,20 +189,20 @@ class BatchSystem:
     def begin(self, state: State, stations: bool = False) -> None:
         """Rebuild the gauges and the user's factors on the present control points, after knots have changed.
 
-        With `stations`, the used detections are matched to the cones of closed curves. SettingsError for a
+        With `stations`, the cones of closed curves constrain the detections along them. SettingsError for a
         user's factor that cannot be used.
         """
         self.own, variables = tuple(self._own(state) if callable(self._own) else self._own), state.variables
         check_keys(self.own, variables.keys, "poses, control points and calibrations of the batch")
         check_linear(self.own, lambda one: variables.gtsam_values(keys_of_factor(one)), constant=False)
         self._given_rows = by_widths([rows for one in self._given for rows in one.on(state)])
-        self.matches = match_stations(state, self.detections, self.settings) if stations else None
+        self.stations = cone_stations(state, self.detections, self.settings) if stations else None
         self.gauges = {label: curve_gauge(state, label, self.sigma_slide) for label in state.boundaries}
 
     @property
     def sigma_slide(self) -> float:
         """Standard deviation of a control point's slide along its curve (m)."""
-        return SIGMA_SLIDE if self.matches else self.settings.batch.sigma_slide
+        return SIGMA_SLIDE if self.stations else self.settings.batch.sigma_slide
 
     @property
     def settings(self) -> MapperSettings:
@@ -233,7 +234,7 @@ class BatchSystem:
         drive = self.drive_rows(state) + revisit_rows(self.revisits, state.poses)
         drive += [at_values(rows, state.variables) for rows in self._given_rows]
         across, u = self._across(state, hold) if state.boundaries else (NO_ROWS, np.zeros(0))
-        along = self._along(state, self.matches) if self.matches else NO_ROWS
+        along = self._along(state, self.stations, hold) if self.stations else NO_ROWS
         unused = len(self.detections) - int(np.isfinite(across.sigma).sum())
         cost = half_square(drive) + unused * self.kernel.gate**2 / 6.0  # the loss of one at the gate
         cost += sum(float(self.kernel.loss(seen.whitened).sum()) for seen in (across, along))
@@ -257,8 +258,8 @@ class BatchSystem:
         foot = self._feet(state, rows, points)
         seen = rows_across(state, detections, rows, points, foot, self.settings.spline.sigma_model)
         if hold:
-            self._sigma[rows] = np.where(foot.interior, seen.sigma, np.inf)
-        return replace(seen, sigma=self._sigma[rows]), foot.u
+            self._sigma[0, rows] = np.where(foot.interior, seen.sigma, np.inf)
+        return replace(seen, sigma=self._sigma[0, rows]), foot.u
 
     def _feet(self, state: State, rows: IntArray, points: Array) -> FootPoints:
         """Refine the foot points of used detections (m,) at points (m, 2)."""
@@ -269,21 +270,37 @@ class BatchSystem:
         search = *stretch, s.refine_iterations
         return FootPoints(*curves.searched.refine(state.map_points, points, curve, *search))
 
-    def settle(self, state: State) -> None:
-        """Refine the foot points of the used detections until they converge."""
-        detections, rows = self.detections, np.flatnonzero(self.detections.used)
+    def associate(self, state: State, gate: float, strict: bool) -> int:
+        """Associate all detections again by `association:associate`; return the number that has changed.
+
+        The foot points are refined until they converge; otherwise the cost would change without a step.
+        """
+        detections = self.detections
+        before = np.where(detections.used, detections.boundary, UNKNOWN)
+        self.kernel = Biweight(gate)
+        detections.correct(state.variables.sensor)
+        associate(state, detections, self.settings, gate, strict)
+        used = rows = np.flatnonzero(detections.used)
         for _ in range(SETTLE_FEET if state.boundaries else 0):
-            before = detections.u[rows]
-            u = self._feet(state, rows, detections.points_map(rows, state.variables)).u
-            detections.refine(rows, u)
-            rows = rows[np.abs(u - before) > SETTLED_FOOT]
+            u = detections.u[rows]
+            foot = self._feet(state, rows, detections.points_map(rows, state.variables))
+            detections.refine(rows, foot.u)
+            rows = rows[np.abs(foot.u - u) > SETTLED_FOOT]
             if len(rows) == 0:
                 break
+        if self.stations is not None:
+            foot = self._feet(state, used, detections.points_map(used, state.variables))
+            self.stations.match(state, detections, used, foot.tangent_unit)
+        return int((np.where(detections.used, detections.boundary, UNKNOWN) != before).sum())
 
-    def _along(self, state: State, matches: StationMatches) -> DetectionRows:
-        """Linearize the used detections at their stations, with the sigmas of the matching."""
-        rows, station, sigma = matches.used(self.detections)
-        return replace(matches.stations.rows(state, self.detections, rows, station, sigma), sigma=sigma)
+    def _along(self, state: State, stations: Stations, hold: bool) -> DetectionRows:
+        """Linearize the used detections at their stations, with the sigmas of this round."""
+        rows = np.flatnonzero(self.detections.used & (self.detections.station != NO_STATION))
+        station = self.detections.station[rows]
+        seen = stations.rows(state, self.detections, rows, station, stations.sigma[station])
+        if hold:
+            self._sigma[1, rows] = seen.sigma
+        return replace(seen, sigma=self._sigma[1, rows])
 
     def rows(self, at: Evaluation, gauges: Mapping[int, CurveGauge] | None = None) -> list[Rows]:
         """All whitened rows of Gauss-Newton at a state; rows of detections have robust weights."""

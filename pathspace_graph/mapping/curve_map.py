@@ -9,13 +9,13 @@ from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.residuals import pair_residuals, sigma_across
+from pathspace_graph.factors.residuals import pair_residuals
 from pathspace_graph.graph.rows import Rows, stacked_rows
 from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, control_keys
 from pathspace_graph.io.map import NO_CONES
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .detection_rows import SIGMA_POSE, Stations
+from .detection_rows import Stations
 from .detections import NO_STATION, DetectionTable
 from .state import State, factor_numbers
 
@@ -143,20 +143,6 @@ class CurveMap:
         own = self.cones.get(label, NO_CONES)
         self.cones = {**self.cones, label: own[~is_gone(own[:, 0])]}
         self.lay_out_stations()
-
-    def match(self, rows: IntArray, directions: Array) -> None:
-        """Match newly used detections (m,) with the stations of a closed map.
-
-        directions (m, 2) are the unit tangents at their foot points, map frame.
-        """
-        if self.stations is None:
-            return
-        detections = self.detections
-        poses = self.variables.poses_at(detections.cycle[rows])
-        sigma = sigma_across(directions, detections.covariance[rows], poses, SIGMA_POSE)
-        for curve in self.stations.curves:
-            own = (detections.boundary[rows] == curve.label) & (detections.label[rows] == curve.label)
-            detections.match(rows[own], curve.matched(detections.u[rows[own]], sigma[own]))
 
     # --- weak priors -------------------------------------------------------------------------------------
 

@@ -9,6 +9,7 @@ import numpy as np
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.factors.residuals import sigma_across
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, Drives, Variables
 from pathspace_graph.spline.boundary import ahead_of
@@ -169,6 +170,17 @@ class Stations:
         numbers = np.array([own.label for own in curves]).repeat([len(own.u) for own in curves])
         places, sigmas = np.concatenate([(own.u, own.sigma) for own in curves], axis=1)
         return cls(tuple(curves), places, sigmas, numbers, value, slope, np.concatenate(columns))
+
+    def match(self, state: State, detections: DetectionTable, rows: IntArray, directions: Array) -> None:
+        """Match used detections (m,) of the colour of their curve with its stations.
+
+        directions (m, 2) are the unit tangents at their foot points, map frame.
+        """
+        poses = state.variables.poses_at(detections.cycle[rows])
+        sigma = sigma_across(directions, detections.covariance[rows], poses, SIGMA_POSE)
+        for curve in self.curves:
+            own = (detections.boundary[rows] == curve.label) & (detections.label[rows] == curve.label)
+            detections.match(rows[own], curve.matched(detections.u[rows[own]], sigma[own]))
 
     def rows(
         self, state: State, detections: DetectionTable, rows: IntArray, station: IntArray, sigma: Array

@@ -104,7 +104,8 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         taken = rows[accepted]
         ambiguous = detections.used[taken] | (np.bincount(taken)[taken] > 1)  # two curves accept it
         detections.take(taken, state.curves.labels[curve[accepted]], foot.u[accepted])
-        self.map.match(taken, foot.tangent_unit[accepted])
+        if self.map.stations is not None:
+            self.map.stations.match(state, detections, taken, foot.tangent_unit[accepted])
         if ambiguous.any():
             detections.release(taken[ambiguous])
         return np.asarray(foot.distance / np.sqrt(variance))

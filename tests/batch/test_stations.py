@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.association import laps_of_detections, match_stations
+from pathspace_graph.batch.association import cone_stations, laps_of_detections
 from pathspace_graph.batch.gtsam_graph import nonlinear_graph
 from pathspace_graph.batch.lap import OpenLap, along_of, lap_optimum, marginal_of, stations_on
 from pathspace_graph.batch.mapper import BatchMapper
@@ -18,6 +18,7 @@ from pathspace_graph.batch.simplification import map_block, simplified
 from pathspace_graph.batch.system import SIGMA_SLIDE, BatchSystem, Evaluation, moved
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Log
+from pathspace_graph.mapping.detections import NO_STATION
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import straight
@@ -63,15 +64,18 @@ def test_detections_of_both_passes_are_of_one_cone(off: float) -> None:
         u = detections.u.copy()
         u[second & (detections.boundary == label)] += off
         detections = replace(detections, u=u)
-    found = match_stations(state, detections, system.settings)
+    found, detections = cone_stations(state, detections, system.settings), detections.copy()
     assert found is not None
-    again = np.concatenate(
-        [laps_of_detections(state, detections, label)[found.rows] > 0 for label in state.boundaries]
-    )
-    assert again.any()
-    cone = true_cones(system, found.rows)
-    for station in np.unique(found.station):
-        assert len(np.unique(cone[found.station == station])) == 1
+    again = 0
+    for curve in found.curves:
+        rows = detections.used_on(curve.label)
+        found.match(state, detections, rows, state.spline(curve.label).tangent_unit(detections.u[rows]))
+        rows = rows[detections.station[rows] != NO_STATION]
+        again += (laps_of_detections(state, detections, curve.label)[rows] > 0).sum()
+        cone, station = true_cones(system, rows), detections.station[rows]
+        for one in np.unique(station):
+            assert len(np.unique(cone[station == one])) == 1
+    assert again > 0
 
 
 def test_the_gradient_is_that_of_the_cost() -> None:
@@ -103,13 +107,13 @@ def test_gtsam_has_the_same_linear_problem() -> None:
 def test_a_station_s_sigma_is_how_it_moves_along_the_few_curve() -> None:
     """By drawing dense control points of their covariance: the few ones follow by the change."""
     system, at, lap = optimum()
-    assert system.matches is not None
+    assert system.stations is not None
     simple = simplified(at.state, system.detections, system.settings)
     few, change = simple.state, simple.change
     _, _, dense = marginal_of(system, at, few, change, lap.first_kept)
-    stations = stations_on(few, system.matches, at.state, change, dense)
+    stations = stations_on(few, system.stations, at.state, change, dense)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(dense)), dense, 2000)
-    for curve in system.matches.stations.curves:
+    for curve in system.stations.curves:
         label, old, new = curve.label, at.state.boundaries[curve.label], few.boundaries[curve.label]
         t = new.evaluate(few.control_points(label), stations[label][:, 0], 1)
         t /= np.hypot(*t.T)[:, None]
@@ -122,7 +126,7 @@ def test_a_station_s_sigma_is_how_it_moves_along_the_few_curve() -> None:
 def test_a_setting_leaves_the_pure_projection() -> None:
     lap = open_lap(MapperSettings(stations=False))
     system, at, _ = lap_optimum(lap)
-    assert system.matches is None and len(at.along.rows) == 0
+    assert system.stations is None and len(at.along.rows) == 0
     assert system.sigma_slide == system.settings.batch.sigma_slide
     assert optimum()[0].sigma_slide == SIGMA_SLIDE
 
@@ -140,4 +144,4 @@ def test_stations_hold_the_vehicle_along_the_curves() -> None:
 def test_a_road_of_lines_has_no_stations() -> None:
     system, state = straight()
     settings = replace(system.settings, kind="line")
-    assert match_stations(state, system.detections, settings) is None
+    assert cone_stations(state, system.detections, settings) is None
