@@ -191,7 +191,6 @@ VIEWS = {"values", "linearized", "poses", "calibrations", "mean"}
 """Arrays of numbers that other rooms write through views (docs/architecture.md, "Owners")."""
 ASSIGNED = {
     "batch.association": {"state.pose_u"},
-    "batch.optimizer": {"system.kernel"},
     "baselines.filters": {"state.pose_u"},
     "graph.smoother": {f"smoother.{part}" for part in ("prior", "inactive", "held", "calibration_prior")}
     | {"smoother.variables.first_cycle", "self.variables.first_cycle"},

@@ -41,12 +41,11 @@ from pathspace_graph.mapping.state import State
 from pathspace_graph.run import Stopwatch, settings_dict, solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
-from .gtsam_graph import drive_factors, nonlinear_graph
 from .lap import evidence_against, unmapped
 from .optimizer import Convergence, Optimizer
 from .simplification import Scatter, Simplified, map_block, own_settings, simplified
 from .start import CurveMapper, find_revisits, start_odometry, start_online
-from .system import BatchSystem, Evaluation, OwnFactors
+from .system import BatchSystem, Evaluation, OwnFactors, drive_factors, nonlinear_graph
 
 NAME: Final = "spline"  # name of the estimator on the command line
 

@@ -196,18 +196,14 @@ def all_detections(judged: JudgedLog) -> DetectionColumns:
     return table
 
 
-def all_cones(judged: JudgedLog) -> DetectionColumns:
-    """Those of `all_detections` that are of cones."""
-    return all_detections(judged).cones(judged.settings.of_lines)
-
-
 def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
     """Find the revisits of a whole drive by its cones: the first return to its beginning, and later ones.
 
     Before the first return the poses are dead reckoned. A revisit that contradicts the poses aligns them. The
     next one is searched `REVISIT_INTERVAL` metres later, nearby.
     """
-    chain, settings, seen = judged.chain, judged.settings, seen_in(all_cones(judged))
+    chain, settings = judged.chain, judged.settings
+    seen = seen_in(all_detections(judged).cones(settings.of_lines))
     closing, reckoned = settings.closing, aligned_odometry(chain, ())
     aligned, poses = reckoned, reckoned.poses
     driven, revisits, due, lap = path_lengths(poses), list[Revisit](), closing.min_path, np.inf

@@ -1,6 +1,6 @@
 """The least-squares problem of one or several whole logs: its cost at a state, and its linearization."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableSequence, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -8,21 +8,41 @@ import gtsam
 import numpy as np
 from scipy.spatial import KDTree
 
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
+from pathspace_graph.factors.gtsam_factors import fill, pose_array
 from pathspace_graph.factors.linear import keys_of_factor
+from pathspace_graph.factors.noise import huber_loss, huber_weights
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.se2 import to_map
+from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square, sensor_prior
 from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners, solution
-from pathspace_graph.graph.rows import Revisit, Rows, at_values, by_widths, revisit_rows
-from pathspace_graph.graph.variables import POINT, Layout, are_poses, of_sensor, pose_keys
+from pathspace_graph.graph.rows import (
+    Revisit,
+    Rows,
+    at_values,
+    by_widths,
+    odometry_factor,
+    revisit_rows,
+)
+from pathspace_graph.graph.variables import (
+    CALIBRATION_KEY,
+    POINT,
+    POSE,
+    Layout,
+    are_poses,
+    of_sensor,
+    pose_key,
+    pose_keys,
+)
 from pathspace_graph.graph.window import check_keys, check_linear, user_rows
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.detection_rows import NO_ROWS, DetectionRows, Stations, rows_across
 from pathspace_graph.mapping.detections import NO_STATION, DetectionTable
+from pathspace_graph.mapping.gtsam_graph import curve_factors
 from pathspace_graph.mapping.state import GivenFactor, State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -118,27 +138,6 @@ def _nearest_poses(state: State, label: int, until: int | None) -> IntArray:
     return nearest_by(position, poses[:, :2], unfit)
 
 
-@dataclass(frozen=True)
-class Biweight:
-    """Tukey's biweight loss `rho(z) = g^2 / 6 (1 - (1 - z^2 / g^2)^3)`, constant beyond the gate g.
-
-    A detection at the gate has no weight, so using one more or less moves nothing.
-    """
-
-    gate: float  # gate g in sigmas
-
-    def loss(self, whitened: Array) -> Array:
-        """Loss `rho(z)` (m,) of whitened residuals z (m,)."""
-        return np.asarray(self.gate**2 / 6.0 * (1.0 - self._inner(whitened) ** 3))
-
-    def weights(self, whitened: Array) -> Array:
-        """Robust weights `rho'(z) / z = (1 - z^2 / g^2)^2` (m,)."""
-        return np.asarray(self._inner(whitened) ** 2)
-
-    def _inner(self, whitened: Array) -> Array:
-        return np.maximum(1.0 - (whitened / self.gate) ** 2, 0.0)
-
-
 @dataclass(frozen=True, eq=False)
 class Evaluation:
     """The problem at one state."""
@@ -175,7 +174,7 @@ class BatchSystem:
         self.own: tuple[gtsam.NonlinearFactor, ...] = ()  # the user's factors, linearized at every step
         self._own, self._given = own, given
         self._given_rows: list[Rows] = []  # the user's factors of an online drive, at values of zero
-        self.kernel = Biweight(LOOSE_GATE)
+        self.gate = LOOSE_GATE  # of the detections in use (sigmas)
         self.gauges: dict[int, CurveGauge] = {}  # of each boundary
         self.stations: Stations | None = None  # stations of closed curves, if they are used
         self._sigma = np.ones((2, len(detections)))  # across and along the curves, of this round (m)
@@ -235,9 +234,9 @@ class BatchSystem:
         drive += [at_values(rows, state.variables) for rows in self._given_rows]
         across, u = self._across(state, hold) if state.boundaries else (NO_ROWS, np.zeros(0))
         along = self._along(state, self.stations, hold) if self.stations else NO_ROWS
-        unused = len(self.detections) - int(np.isfinite(across.sigma).sum())
-        cost = half_square(drive) + unused * self.kernel.gate**2 / 6.0  # the loss of one at the gate
-        cost += sum(float(self.kernel.loss(seen.whitened).sum()) for seen in (across, along))
+        unused = len(self.detections) - int(np.isfinite(across.sigma).sum())  # each as one at the gate
+        whitened = np.concatenate([across.whitened, along.whitened, np.full(unused, self.gate)])
+        cost = half_square(drive) + float(huber_loss(whitened, self.settings.gate.huber).sum())
         cost += half_square(self._priors(state, self.gauges))
         own_rows, own_cost = by_widths(user_rows(self.own, state.variables)), 0.0
         if self.own:
@@ -277,7 +276,7 @@ class BatchSystem:
         """
         detections = self.detections
         before = np.where(detections.used, detections.boundary, UNKNOWN)
-        self.kernel = Biweight(gate)
+        self.gate = gate
         detections.correct(state.variables.sensor)
         associate(state, detections, self.settings, gate, strict)
         used = rows = np.flatnonzero(detections.used)
@@ -296,8 +295,7 @@ class BatchSystem:
     def _along(self, state: State, stations: Stations, hold: bool) -> DetectionRows:
         """Linearize the used detections at their stations, with the sigmas of this round."""
         rows = np.flatnonzero(self.detections.used & (self.detections.station != NO_STATION))
-        station = self.detections.station[rows]
-        seen = stations.rows(state, self.detections, rows, station, stations.sigma[station])
+        seen = stations.rows(state, self.detections, rows)
         if hold:
             self._sigma[1, rows] = seen.sigma
         return replace(seen, sigma=self._sigma[1, rows])
@@ -307,14 +305,20 @@ class BatchSystem:
         groups = [*at.drive]
         for seen in (at.along, at.across):
             owner = owners(self.detections.cycle[seen.rows], self.detections.boundary[seen.rows])
-            groups.append(seen.weighted(self.kernel.weights(seen.whitened), owner))
+            groups.append(seen.weighted(huber_weights(seen.whitened, self.settings.gate.huber), owner))
         return groups + self._priors(at.state, gauges or self.gauges)
 
     def _priors(self, state: State, gauges: Mapping[int, CurveGauge]) -> list[Rows]:
         """Rows of the weak priors: gauges, and as online smoothness and anchors of control points."""
         beside = [gauge.rows(state.control_points(label), state.poses) for label, gauge in gauges.items()]
-        on_points = CurveMap(self.settings, state).linear_gauge(whole=True)
+        on_points = self.track(state).linear_gauge(whole=True)
         return beside + [replace(rows, owner=-1 - rows.owner) for rows in on_points]
+
+    def track(self, state: State) -> CurveMap:
+        """The curves of a state with the detections of the problem."""
+        track = CurveMap(self.settings, state)
+        track.detections, track.stations = self.detections, self.stations
+        return track
 
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
         """Linear graph of all rows; its solution is the change from the state."""
@@ -377,3 +381,68 @@ def moved(state: State, step: Array) -> State:
     after = state.copy()
     after.variables.values[len(after.variables.values) - len(step) :] += step
     return after
+
+
+# --- the problem as GTSAM's own factors ------------------------------------------------------------------
+
+
+def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFactorGraph:
+    """Build every factor of the problem, on the keys of `graph.variables`.
+
+    It has the associations of `at`. At an optimum it has the linearization of the optimization, and its error
+    is the cost, without the constant share of detections that are not in use. SettingsError for several
+    drives.
+    """
+    factors, graph = [*drive_factors(system, at)], gtsam.NonlinearFactorGraph()
+    for label, gauge in system.gauges.items():
+        factors += [factor_beside(gauge, j) for j in range(len(gauge.keys))]
+        factors += curve_factors(system.track(at.state), label, spacing=False)
+    for factor in factors:
+        graph.add(factor)
+    return graph
+
+
+def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield factors of poses and calibrations, and the user's; SettingsError for several drives."""
+    if len(at.state.drives) > 1:
+        raise SettingsError(f"graph: expected the batch of one drive, found {len(at.state.drives)} drives")
+    for k, interval in enumerate(system.chains[0].odometry.intervals):
+        yield odometry_factor(k, interval)
+    for one in system.revisits:
+        root = one.root.copy()  # GTSAM's tangents are in the frame of the later pose
+        root[:, :2] = root[:, :2] @ rotation(one.local[2])
+        noise = gtsam.noiseModel.Gaussian.Information(root.T @ root)
+        ends = pose_key(one.earlier), pose_key(one.later)
+        yield gtsam.BetweenFactorPose2(*ends, gtsam.Pose2(*one.local), noise)
+    chain, calibration, noises = system.chains[0], system.settings.calibration, gtsam.noiseModel
+    map_from_pose = np.eye(POSE)  # GTSAM's tangents of a pose are in its own frame
+    map_from_pose[:2, :2] = rotation(at.state.poses[0, 2])
+    noise = noises.Gaussian.Information(map_from_pose.T @ chain.first_information @ map_from_pose)
+    yield gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(*chain.first), noise)
+    sigmas = noises.Diagonal.Sigmas(chain.calibration_sigma)
+    yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, chain.calibration_mean, sigmas)
+    if chain.bias is not None:
+        noise = noises.Diagonal.Precisions(np.array([0.0, chain.bias.sigma**-2]))
+        yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.array([0.0, chain.bias.value]), noise)
+    sensor_key = at.state.variables.sensor_key
+    if sensor_key is not None:
+        sigmas = noises.Diagonal.Sigmas(np.array(calibration.sigmas))
+        yield gtsam.PriorFactorVector(sensor_key, np.array(calibration.means), sigmas)
+    yield from system.own
+
+
+def factor_beside(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
+    """Build the factor that keeps control point j of a curve beside its pose."""
+    point_key, cycle = int(gauge.keys[j]), int(gauge.cycle[j])
+    alone = replace(gauge, ahead=gauge.ahead[j : j + 1])
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: MutableSequence[Array] | None) -> Array:
+        pose = values.atPose2(pose_key(cycle))
+        point = np.array(values.atPoint2(point_key))
+        residual, by_point, by_pose = alone.terms(point[None], pose_array(pose)[None])
+        if H is not None:  # GTSAM's tangents of a pose are in its own frame
+            by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
+            fill(H, [by_point, by_pose])
+        return residual
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [point_key, pose_key(cycle)], error)

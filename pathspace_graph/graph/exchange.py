@@ -21,9 +21,9 @@ GRAPH_FILE: Final = "graph.json"  # in the folder of a result
 def portable(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.NonlinearFactorGraph:
     """Return a graph that GTSAM can serialize: factors in Python are linearized at the values.
 
-    A `gtsam.LinearContainerFactor` has the error and the gradient of the factor at the values. So an optimum
-    stays one, and away from it the factor is its quadratic approximation. It holds only the variables that
-    the factor depends on there.
+    A `gtsam.LinearContainerFactor` has the gradient of the factor at the values. So an optimum stays one, and
+    away from it the factor is its quadratic approximation: the error of a detection beyond Huber's threshold
+    is its weighted square. It holds only the variables that the factor depends on there.
     """
     found = gtsam.NonlinearFactorGraph()
     for factor in (graph.at(k) for k in range(graph.size())):

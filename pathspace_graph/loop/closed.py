@@ -54,7 +54,11 @@ class Closed(Phase):
         if drive.solver.is_busy:
             outcome = drive.outcome(road, spent)
             return Step(self) if outcome is None else self.take(road, drive, outcome)
-        self._fix_gauge(road)
+        smoother = road.smoother
+        if not smoother.user_factors.given and smoother.held is None:  # user factors may observe the gauge
+            longest = max(boundary.length for boundary in road.boundaries.values())
+            if road.path.length > self._settled + road.settings.closing.gauge_laps * longest:
+                fix_gauge(smoother)
         return Step(self, notice=self._repair(road, drive, reading))
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
@@ -83,15 +87,6 @@ class Closed(Phase):
             return ""
         self.known_loop = KnownLoop()
         return self.map_repair.in_place(road.smoother)
-
-    def _fix_gauge(self, road: Road) -> None:
-        """Fix the gauge of the map after enough laps, unless user factors may observe it."""
-        smoother = road.smoother
-        if smoother.user_factors.given or smoother.held is not None:
-            return
-        longest = max(boundary.length for boundary in road.boundaries.values())
-        if road.path.length > self._settled + road.settings.closing.gauge_laps * longest:
-            fix_gauge(smoother)
 
 
 def _crosses(road: Road, drive: Drive) -> bool:

@@ -256,8 +256,12 @@ class Drive(Copyable):
         smoother = road.smoother
         return self.solver.outcome(road.next_cycle - 1, smoother.times, smoother.first_cycle, spent)
 
-    def take(self, road: Road, solved: LapMarginal) -> Array:
-        """Replace the map by that of a batch of the drive; return the jump (3,) of the newest pose."""
+    def take(self, road: Road, solved: LapMarginal, revisit: Revisit | None = None) -> Array:
+        """Replace the map by that of a batch, which a revisit may have started; return the jump (3,)."""
+        if revisit is not None and solved.closed:
+            self.closed_by = revisit
+        elif revisit is not None:
+            self.revisits = (*self.revisits, revisit)
         self.record.linearize(road)
         jump = take_marginal(road, solved, self.record.factors)
         self.lap_seconds = solved.seconds

@@ -17,7 +17,6 @@ from pathspace_graph.graph.variables import POSE
 from pathspace_graph.health import SHARE_DEGRADED, Evidence
 from pathspace_graph.io.map import NO_CONES
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
 from pathspace_graph.mapping.state import SAMPLE
 
@@ -88,18 +87,6 @@ def is_mapped(u: Array, cones: Array, length: float, gap: float, margin: float) 
     return np.asarray(near_end | (steps <= gap * np.median(steps))[before])
 
 
-def lay_out_loop(track: CurveMap) -> Loop:
-    """Sample both closed curves."""
-    curves, mapped, begins, margin = {}, {}, {}, track.settings.growth.merge_radius
-    for label, boundary in track.state.boundaries.items():
-        u = np.arange(boundary.tables.low, boundary.tables.high, SAMPLE)
-        curves[label] = KDTree(boundary.evaluate(track.state.control_points(label), u))
-        begins[label] = boundary.tables.low
-        cones = track.cones.get(label, NO_CONES)[:, 0]
-        mapped[label] = is_mapped(u, cones, boundary.length, GAP_RATIO, margin)
-    return Loop(curves, mapped, begins)
-
-
 class KnownLoop(Copyable):
     """Cache of the sampled loop, renewed when the curves are replaced."""
 
@@ -113,7 +100,15 @@ class KnownLoop(Copyable):
         if self._laid_out is None or self._laid_out[0] != tables:
             values = state.variables.values.copy()
             smoother.refresh()
-            self._laid_out = tables, lay_out_loop(smoother.map)
+            curves, mapped, begins = {}, {}, {}
+            margin = smoother.map.settings.growth.merge_radius
+            for label, boundary in state.boundaries.items():
+                u = np.arange(boundary.tables.low, boundary.tables.high, SAMPLE)
+                curves[label] = KDTree(boundary.evaluate(state.control_points(label), u))
+                begins[label] = boundary.tables.low
+                cones = smoother.map.cones.get(label, NO_CONES)[:, 0]
+                mapped[label] = is_mapped(u, cones, boundary.length, GAP_RATIO, margin)
+            self._laid_out = tables, Loop(curves, mapped, begins)
             state.variables.values[:] = values
         return self._laid_out[1]
 

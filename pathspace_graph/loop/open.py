@@ -112,14 +112,12 @@ class Open(Phase):
         assert self.asked_by is not None
         if self._closes:
             road.smoother.settle()
-            drive.closed_by = self.asked_by
-            jump = drive.take(road, outcome)
+            jump = drive.take(road, outcome, self.asked_by)
             return Step(self.CLOSED(road, drive), jump)
         if road.growth.taken_back > self._taken_back:
             return Step(self, notice=f"{failed}: a curve was taken back")
         notice = "" if drive.revisits else REVISITED  # only the first time
-        drive.revisits = (*drive.revisits, self.asked_by)
-        return Step(self, drive.take(road, outcome), notice)
+        return Step(self, drive.take(road, outcome, self.asked_by), notice)
 
 
 def open_map(road: Road, poses: Array) -> StartMap:

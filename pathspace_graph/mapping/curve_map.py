@@ -81,20 +81,9 @@ class CurveMap:
         rows = rows[detections.station[rows] != NO_STATION]
         if stations is None or len(rows) == 0:
             return []
-        station = detections.station[rows]
-        sigma_station = self.sigma_stations(station)
-        seen = stations.rows(self.state, detections, rows, station, sigma_station)
+        seen = stations.rows(self.state, detections, rows)
         weights = huber_weights(seen.whitened, self.settings.gate.huber)
         return [seen.weighted(weights, detections.cycle[rows])]
-
-    def sigma_stations(self, station: IntArray) -> Array:
-        """Standard deviations (m,) of stations (m,) along their curves, for a single detection (m).
-
-        The error of a station is the same in all of its detections, so each gets its variance times their
-        number.
-        """
-        assert self.stations is not None
-        return np.asarray(SIGHTINGS_IN_WINDOW**0.5 * self.stations.sigma[station])
 
     def correct(self) -> None:
         """Do nothing: detections are corrected on access."""
@@ -136,7 +125,7 @@ class CurveMap:
         """Make the cones stations on the present curves, if all curves have some."""
         labels = [*self.state.boundaries] if self.settings.stations else []
         known = labels and all(len(self.cones.get(label, ())) for label in labels)
-        self.stations = Stations.of(self.state, self.cones) if known else None
+        self.stations = Stations.of(self.state, self.cones, SIGHTINGS_IN_WINDOW) if known else None
 
     def forget_cones(self, label: int, is_gone: Callable[[Array], BoolArray]) -> None:
         """Remove the cones of a curve that are gone, by their parameters (k,)."""

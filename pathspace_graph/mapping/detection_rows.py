@@ -147,15 +147,19 @@ class Stations:
 
     curves: tuple[CurveStations, ...]
     u: Array  # (k,) parameters (m)
-    sigma: Array  # (k,) standard deviations along the curves (m)
+    sigma: Array  # (k,) standard deviations along the curves, for a single detection (m)
     label: IntArray  # (k,) boundary of each
     value: Array  # (k, p + 1) basis functions at the stations
     slope: Array  # (k, p + 1) their derivatives (1/m)
     columns: IntArray  # (k, p + 1) control points that they weigh, by row of `State.map_points`
 
     @classmethod
-    def of(cls, state: State, cones: Mapping[int, Array]) -> Self:
-        """Place cones (k, 2), at least one on each curve, by label: parameters, and sigmas along it (m)."""
+    def of(cls, state: State, cones: Mapping[int, Array], sightings: float = 1.0) -> Self:
+        """Place cones (k, 2), at least one on each curve, by label: parameters, and sigmas along it (m).
+
+        The error of a station is the same in all of its `sightings`, so each gets its variance times their
+        number.
+        """
         curves, columns, values, before, count = list[CurveStations](), [], [], 0, 0
         for label, boundary in state.boundaries.items():
             ends = boundary.tables.low, boundary.tables.high if boundary.periodic else np.inf
@@ -169,6 +173,7 @@ class Stations:
         value, slope = map(np.ascontiguousarray, np.concatenate(values, axis=1))
         numbers = np.array([own.label for own in curves]).repeat([len(own.u) for own in curves])
         places, sigmas = np.concatenate([(own.u, own.sigma) for own in curves], axis=1)
+        sigmas = np.sqrt(sightings) * sigmas
         return cls(tuple(curves), places, sigmas, numbers, value, slope, np.concatenate(columns))
 
     def match(self, state: State, detections: DetectionTable, rows: IntArray, directions: Array) -> None:
@@ -182,14 +187,13 @@ class Stations:
             own = (detections.boundary[rows] == curve.label) & (detections.label[rows] == curve.label)
             detections.match(rows[own], curve.matched(detections.u[rows[own]], sigma[own]))
 
-    def rows(
-        self, state: State, detections: DetectionTable, rows: IntArray, station: IntArray, sigma: Array
-    ) -> DetectionRows:
-        """Linearize `t . (R z + t - S(u))` for detections (m,) at stations (m,) with sigmas (m,) in m.
+    def rows(self, state: State, detections: DetectionTable, rows: IntArray) -> DetectionRows:
+        """Linearize `t . (R z + t - S(u))` for detections (m,) at their stations.
 
         The terms are those of `factors._kernels:station_rows`.
         """
-        cycle, variables, columns = detections.cycle[rows], state.variables, self.columns[station]
+        cycle, variables, station = detections.cycle[rows], state.variables, detections.station[rows]
+        columns = self.columns[station]
         measuring = measuring_keys(cycle, variables, state.drives)
         keys = np.concatenate([measuring, state.map_keys[columns]], axis=1)
         points = detections.points_map(rows, variables)
@@ -206,7 +210,7 @@ class Stations:
                 detections.measured[chosen],
                 detections.twist[chosen],
                 sensor,
-                sigma[own],
+                self.sigma[cones],
             )
 
         return DetectionRows(rows, keys, *state.drives.by_sensor(terms, cycle, variables.sensor))

@@ -137,11 +137,6 @@ class Road:
     def next_cycle(self) -> int:
         return self.smoother.next_cycle
 
-    def used_in_newest(self) -> int:
-        """Number of used detections of the newest cycle."""
-        detections = self.smoother.map.detections
-        return int(detections.used[detections.cycle.searchsorted(self.next_cycle - 1) :].sum())
-
     def orange_cones(self) -> dict[int, PointBoundary]:
         """Merge the orange cones by label, with the present poses of the window."""
         seen = self.orange.copy()

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
@@ -10,13 +9,16 @@ import numpy as np
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.graph.rows import Revisit
+from pathspace_graph.graph.gaussian import factors_of
+from pathspace_graph.graph.rows import Revisit, odometry_factor
 from pathspace_graph.graph.variables import POINT, POSE, name, pose_key, pose_keys
 from pathspace_graph.graph.variables import UNKNOWN as UNKNOWN_PLACE
+from pathspace_graph.graph.window import as_nonlinear
 from pathspace_graph.io.map import NO_CONES, NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.io.results import LapBatches, VehicleState
 from pathspace_graph.loop.drive import Drive, Phase
 from pathspace_graph.loop.lost import Lost
+from pathspace_graph.mapping.gtsam_graph import curve_factors
 from pathspace_graph.mapping.motion import vehicle_state, with_size
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.run import Readings
@@ -24,7 +26,6 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.planning import CurveAhead, TrackAhead, check_line, track_ahead
 
-from .gtsam_graph import window_graph
 from .outlook import Outlook, confirmed, curves_ahead, joint_covariance_of, look_ahead
 
 
@@ -46,9 +47,34 @@ class MapperEstimate:
     def map(self) -> Map:
         """Return a copy of the map, with the joint covariance of each boundary's control points.
 
-        An open curve includes the tentative stretch that `outline` describes.
+        An open curve includes the tentative stretch that `outline` describes. The covariance of a closed
+        curve includes the scatter of the cones about it.
         """
-        return road_map(self.road, self._sigma_size)
+        road, track = self.road, self.road.smoother.map
+        with self.looked_at():
+            outlooks, points = self._outlooks(), road.orange_cones()
+            if not outlooks:
+                return Map(road.closed, {}, points=points)
+            newest = pose_keys(np.array([road.next_cycle - 1]))
+            joint = road.smoother.covariance(np.concatenate([track.state.map_keys, newest]))
+            lengths = np.concatenate([track.state.map_points.ravel(), road.poses[-1, :2], [0.0]])
+            joint = with_size(joint, lengths, self._sigma_size)
+            if road.closed:
+                sizes, shape = [len(one.known) for one in outlooks.values()], road.settings.spline.sigma_shape
+                of_label = zip(outlooks, sizes, strict=True)
+                sigmas = [track.scatter.get(label, np.full(size, shape)) for label, size in of_label]
+                joint = joint[:-POSE, :-POSE] + np.diag(np.repeat(np.concatenate(sigmas), POINT) ** 2)
+                blocks = [slice(*ends) for ends in pairwise([0, *(POINT * np.cumsum(sizes)).tolist()])]
+            else:
+                joint, blocks = joint_covariance_of(list(outlooks.values()), joint, road.poses[-1])
+            cones = {} if road.settings.of_lines else track.cones
+            boundaries = {
+                label: SplineBoundary(
+                    outlook.spline, joint[block, block], outlook.confirmed_until, cones.get(label, NO_CONES)
+                )
+                for (label, outlook), block in zip(outlooks.items(), blocks, strict=True)
+            }
+            return Map(road.closed, boundaries, joint, points)
 
     def outline(self) -> Map:
         """Return a copy of the map without covariances, in a hundredth of the time of `map`.
@@ -56,7 +82,20 @@ class MapperEstimate:
         Past `confirmed_until` an open curve is tentative: each call fits it through cones with fewer
         detections. A boundary without a confirmed curve may consist of a tentative stretch alone.
         """
-        return road_outline(self.road)
+        with self.looked_at():
+            boundaries = {
+                label: SplineBoundary(outlook.spline, NO_COVARIANCE, outlook.confirmed_until)
+                for label, outlook in self._outlooks().items()
+            }
+        return Map(self.road.closed, boundaries, points=self.road.orange_cones())
+
+    def _outlooks(self) -> dict[int, Outlook]:
+        """Curves by label, open ones with their tentative stretches."""
+        road = self.road
+        road.smoother.refresh()
+        if road.closed or road.next_cycle == 0:
+            return confirmed(road.smoother.map)
+        return look_ahead(road.smoother.map, road.growth.tentative, road.path, road.smoother.times[-1])
 
     def ahead(self, distance: float, step: float = 1.0) -> TrackAhead:
         """Return the next `distance` metres of the track in the vehicle's frame, `step` (m) apart.
@@ -90,7 +129,16 @@ class MapperEstimate:
 
         Parameters of the foot points are of the last linearization, positions of the present curve.
         """
-        return readings_of(self.road)
+        track, table = self.road.smoother.map, self.road.smoother.map.detections
+        newest = slice(int(table.cycle.searchsorted(self.road.next_cycle - 1)), None)
+        used, boundary = table.used[newest].copy(), table.boundary[newest].copy()
+        points = table.points_map(newest, track.variables)
+        feet = np.full(points.shape, np.nan)
+        for label, curve in self.road.boundaries.items():
+            on = np.flatnonzero(used & (boundary == label))
+            if len(on):
+                feet[on] = curve.evaluate(track.state.control_points(label), table.u[newest][on])
+        return Readings(points, boundary, used, feet)
 
     def vehicle_state(self) -> VehicleState:
         """Return the newest pose and the calibration, with their joint covariance."""
@@ -104,7 +152,15 @@ class MapperEstimate:
         the mapper's own system in GTSAM's tangent space of the poses. The graph shares nothing with the
         mapper: optimize it, print its errors, or compute its marginals with GTSAM's classes.
         """
-        return window_graph(self.road)
+        smoother, graph = self.road.smoother, gtsam.NonlinearFactorGraph()
+        factors = [one for label in self.road.boundaries for one in curve_factors(smoother.map, label)]
+        intervals = enumerate(smoother.window.odometry.intervals, start=smoother.first_cycle)
+        factors += [odometry_factor(cycle, interval) for cycle, interval in intervals]
+        prior = factors_of(smoother.absolute_prior())
+        linear = [as_nonlinear(factor, smoother.variables) for factor in prior]
+        for factor in (*factors, *smoother.user_factors.factors, *linear):
+            graph.add(factor)
+        return graph
 
     def values(self) -> gtsam.Values:
         """Return the active variables: poses as `Pose2`, control points and calibrations as points."""
@@ -162,7 +218,10 @@ class MapperEstimate:
     def smoothed(self, t: Array) -> Array:
         """Return the corrected poses (n, 3) at stamps t (n,) of cycles; NaN after the last corrected one."""
         poses = self.corrected_poses
-        return smoothed_at(t, np.array([*self.drive.record.stamps][: len(poses)]), poses)
+        stamps = np.array([*self.drive.record.stamps][: len(poses)])
+        found, known = np.full((len(t), POSE), np.nan), t <= stamps.max(initial=-np.inf)
+        found[known] = poses[np.maximum(stamps.searchsorted(t[known], side="right") - 1, 0)]
+        return found
 
     @property
     def revisits(self) -> tuple[Revisit, ...]:
@@ -221,79 +280,3 @@ class MapperEstimate:
     def _sigma_size(self) -> float:
         """Return the relative standard deviation of the map's size, if it is not estimated (-)."""
         return self.drive.priors.odometry.sigma_size
-
-
-# --- what queries ask a road -----------------------------------------------------------------------------
-
-
-def road_map(road: Road, sigma_size: float) -> Map:
-    """Return the map with the joint covariance of each boundary's control points, and the orange cones.
-
-    `sigma_size` is the relative standard deviation of the map's size. The covariance of a closed curve
-    includes the scatter of the cones about it.
-    """
-    with road.smoother.variables.looked_at():
-        return replace(_map_of(road, sigma_size), points=road.orange_cones())
-
-
-def _map_of(road: Road, sigma_size: float) -> Map:
-    track, outlooks = road.smoother.map, _outlooks(road)
-    if not outlooks:
-        return Map(road.closed, {})
-    newest = pose_keys(np.array([road.next_cycle - 1]))
-    joint = road.smoother.covariance(np.concatenate([track.state.map_keys, newest]))
-    lengths = np.concatenate([track.state.map_points.ravel(), road.poses[-1, :2], [0.0]])
-    joint = with_size(joint, lengths, sigma_size)
-    if road.closed:
-        sizes, shape = [len(one.known) for one in outlooks.values()], road.settings.spline.sigma_shape
-        sigmas = [track.scatter.get(b, np.full(n, shape)) for b, n in zip(outlooks, sizes, strict=True)]
-        joint = joint[:-POSE, :-POSE] + np.diag(np.repeat(np.concatenate(sigmas), POINT) ** 2)
-        blocks = [slice(*ends) for ends in pairwise([0, *(POINT * np.cumsum(sizes)).tolist()])]
-    else:
-        joint, blocks = joint_covariance_of(list(outlooks.values()), joint, road.poses[-1])
-    cones = {} if road.settings.of_lines else track.cones
-    boundaries = {
-        label: SplineBoundary(
-            outlook.spline, joint[block, block], outlook.confirmed_until, cones.get(label, NO_CONES)
-        )
-        for (label, outlook), block in zip(outlooks.items(), blocks, strict=True)
-    }
-    return Map(road.closed, boundaries, joint)
-
-
-def road_outline(road: Road) -> Map:
-    """Return the map without covariances, in a hundredth of the time of `road_map`."""
-    with road.smoother.variables.looked_at():
-        boundaries = {
-            label: SplineBoundary(outlook.spline, NO_COVARIANCE, outlook.confirmed_until)
-            for label, outlook in _outlooks(road).items()
-        }
-    return Map(road.closed, boundaries, points=road.orange_cones())
-
-
-def _outlooks(road: Road) -> dict[int, Outlook]:
-    road.smoother.refresh()
-    if road.closed or road.next_cycle == 0:
-        return confirmed(road.smoother.map)
-    return look_ahead(road.smoother.map, road.growth.tentative, road.path, road.smoother.times[-1])
-
-
-def readings_of(road: Road) -> Readings:
-    """Return the used and gated detections of the newest cycle, as in `MapperEstimate.readings`."""
-    track, table = road.smoother.map, road.smoother.map.detections
-    newest = slice(int(table.cycle.searchsorted(road.next_cycle - 1)), None)
-    used, boundary = table.used[newest].copy(), table.boundary[newest].copy()
-    points = table.points_map(newest, track.variables)
-    feet = np.full(points.shape, np.nan)
-    for label, curve in road.boundaries.items():
-        on = np.flatnonzero(used & (boundary == label))
-        if len(on):
-            feet[on] = curve.evaluate(track.state.control_points(label), table.u[newest][on])
-    return Readings(points, boundary, used, feet)
-
-
-def smoothed_at(t: Array, stamps: Array, poses: Array) -> Array:
-    """Return the poses (n, 3) at t (n,) among poses (k, 3) at stamps (k,) of cycles; NaN past the last."""
-    found, known = np.full((len(t), POSE), np.nan), t <= stamps.max(initial=-np.inf)
-    found[known] = poses[np.maximum(stamps.searchsorted(t[known], side="right") - 1, 0)]
-    return found

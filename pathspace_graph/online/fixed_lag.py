@@ -218,7 +218,8 @@ class FixedLagMapper(MapperEstimate):
         road = self.road
         left, right = (road.boundaries[b].size if b in road.boundaries else 0 for b in (LEFT, RIGHT))
         pose = road.poses[-1].copy() if len(road.poses) else np.zeros(POSE)
-        used, closed = road.used_in_newest(), road.closed
+        detections, closed = road.smoother.map.detections, road.closed
+        used = int(detections.used[detections.cycle.searchsorted(road.next_cycle - 1) :].sum())
         return CycleResult(t, pose, (left, right), used, closed, stages, jump, notice, self.health)
 
     def noise_used(self) -> RunNoise:

@@ -146,7 +146,7 @@ class BatchSettings(Checked):
     dense_share: ClassVar[float] = 1.0  # control points for each cone of the curves that are solved for
     sigma_model: ClassVar[float] = 0.05  # m, of a cone's distance from these; online they have fewer points
     sigma_slide: ClassVar[float] = 0.2  # m, of a control point's slide along its curve
-    gate: ClassVar[float] = 4.0  # sigmas, width of Tukey's loss: beyond it a detection has no weight
+    gate: ClassVar[float] = 4.0  # sigmas of a detection from its curve, beyond which it is not used
 
 
 @dataclass(frozen=True)

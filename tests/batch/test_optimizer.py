@@ -54,7 +54,7 @@ def test_the_gate_shrinks_by_its_factor_to_its_last_value() -> None:
     """Only with the last gate may the optimization end, however little has changed before."""
     system, state = noisy()
     gates: list[float] = []
-    optimizer = Optimizer(system, on_round=lambda: gates.append(system.kernel.gate))
+    optimizer = Optimizer(system, on_round=lambda: gates.append(system.gate))
     _, convergence = optimizer.run(state, Stage(8.0, 12, 1e9))
     expected = [8.0 * GATE_FACTOR**k for k in range(2)] + [BATCH.gate]
     np.testing.assert_allclose(gates, expected)
@@ -108,7 +108,7 @@ def test_associations_that_hardly_change_are_searched_no_more(monkeypatch: pytes
         searched.append(arguments)
         associate(*arguments)
 
-    monkeypatch.setattr("pathspace_graph.batch.optimizer.associate", counted)
+    monkeypatch.setattr("pathspace_graph.batch.system.associate", counted)
     system, state = noisy()
     _, convergence = Optimizer(system).run(state, Stage(BATCH.gate, 40, 1e-4))
     assert 1 <= len(searched) < convergence.rounds

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.association import associate, locate_poses
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import start_odometry
-from pathspace_graph.batch.system import BatchSystem, Biweight, moved
+from pathspace_graph.batch.system import BatchSystem, moved
+from pathspace_graph.factors.noise import huber_loss
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import solution
@@ -25,8 +26,6 @@ from ..scenes.drives import bean_track, lap_log, true_poses
 
 Array = NDArray[np.float64]
 
-KERNEL = Biweight(4.0)
-
 
 @cache
 def small_system() -> tuple[BatchSystem, State]:
@@ -38,7 +37,7 @@ def small_system() -> tuple[BatchSystem, State]:
     noise = np.random.default_rng(1).normal(0.0, 0.1, detections.measured.shape)
     detections.measured = detections.measured + noise
     system = BatchSystem(detections, [chain], [settings])
-    system.kernel = Biweight(settings.batch.gate)
+    system.gate = settings.batch.gate
     state = start_odometry(system)
     system.begin(state)
     state = moved(state, np.random.default_rng(2).normal(0.0, 0.01, state.variables.layout.size))
@@ -146,33 +145,16 @@ def test_a_step_of_the_poses_leaves_the_rest() -> None:
     np.testing.assert_array_equal(after.variables.calibration, state.variables.calibration)
 
 
-def test_the_weight_is_the_slope_of_the_loss() -> None:
-    z = np.linspace(-6.0, 6.0, 42)
-    h = 1e-5
-    slope = (KERNEL.loss(z + h) - KERNEL.loss(z - h)) / (2.0 * h)
-    np.testing.assert_allclose(KERNEL.weights(z) * z, slope, atol=1e-5)
-
-
-def test_near_zero_the_loss_is_half_the_square() -> None:
-    z = np.array([-0.01, 0.0, 0.01])
-    np.testing.assert_allclose(KERNEL.loss(z), 0.5 * z**2, rtol=1e-4)
-
-
-def test_beyond_the_gate_the_loss_is_constant() -> None:
-    np.testing.assert_allclose(KERNEL.loss(np.array([4.0, 5.0, 50.0])), KERNEL.gate**2 / 6.0)
-    np.testing.assert_array_equal(KERNEL.weights(np.array([-4.0, 4.0, 50.0])), 0.0)
-    assert KERNEL.weights(np.array([3.99]))[0] < 1e-4
-
-
 def test_a_detection_that_is_not_in_use_costs_as_much_as_one_at_the_gate() -> None:
     system, state = small_system()
     used, before = system.detections.used.copy(), system.evaluate(state)
     row = before.across.rows[before.across.whitened.argmin()]
-    loss = float(system.kernel.loss(before.across.whitened[before.across.rows == row])[0])
+    whitened = before.across.whitened[before.across.rows == row]
     system.detections.release(np.array([row]))
     after = system.evaluate(state).cost
     system.detections.used[:] = used
-    assert after - before.cost == pytest.approx(system.kernel.gate**2 / 6.0 - loss, rel=1e-6)
+    expected = huber_loss(np.array([system.gate, *whitened]), system.settings.gate.huber)
+    assert after - before.cost == pytest.approx(expected[0] - expected[1], rel=1e-6)
 
 
 def test_wider_priors_hold_the_calibration_of_the_odometry_less() -> None:

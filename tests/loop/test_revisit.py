@@ -307,7 +307,8 @@ def test_the_batch_takes_them_from_the_online_run() -> None:
     assert errors(result.trajectory, truth).mean() < 0.2
     ordering = result.optimum.state.variables.layout.ordering
     theirs = result.graph().linearize(result.values()).hessian(ordering)[0]
-    ours = result.system.linear_graph(result.optimum).hessian(ordering)[0]
+    at = result.system.evaluate(result.optimum.state, hold=True)
+    ours = result.system.linear_graph(at).hessian(ordering)[0]
     traces = [np.trace(matrix[-3:-1, -3:-1]) for matrix in (theirs, ours)]
     assert traces[0] == pytest.approx(traces[1])
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.association import add_drive, associate, locate_poses
 from pathspace_graph.batch.simplification import boundary_of, own_settings
 from pathspace_graph.batch.start import start_odometry
-from pathspace_graph.batch.system import BatchSystem, Biweight, moved
+from pathspace_graph.batch.system import BatchSystem, moved
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import by_sensor
 from pathspace_graph.front_end.front_end import judge_log
@@ -31,8 +31,6 @@ from .drives import DT, ahead, corridor, exact_log
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-LEAST_SQUARES = 1e3
-"""This gate (sigmas) is so wide that the loss is the square."""
 SMOOTHNESS = 20.0
 """The prior of smoothness is so weak that it doesn't reduce errors: the truth is smoother than the noise."""
 COURSE = 120.0
@@ -44,10 +42,11 @@ def straight(
 ) -> tuple[BatchSystem, State]:
     """Returns an exact drive at 6 m/s between two rows of cones at its optimum, every detection used.
 
-    The calibration of the sensor is estimated, or is not.
+    The calibration of the sensor is estimated, or is not. Residuals are squared, whatever their size.
     """
     whole = MapperSettings(calibration=CalibrationSettings(sensor=sensor))
     whole = replace(whole, batch=replace(whole.batch, sigma_smoothness=smoothness))
+    whole = replace(whole, gate=replace(whole.gate, huber=np.inf))
     cones, labels = corridor(60.0)
     log = exact_log(ahead(6.0, seconds), cones, labels)
     settings = own_settings(whole)
@@ -57,7 +56,6 @@ def straight(
     )
     detections.twist[:] = ahead(6.0, 1.0)[0]
     system = BatchSystem(detections, [chain], [settings])
-    system.kernel = Biweight(LEAST_SQUARES)
     state = start_odometry(system)
     system.begin(state)
     locate_poses(state)
@@ -90,7 +88,6 @@ def drawn(system: BatchSystem, rng: np.random.Generator) -> tuple[BatchSystem, A
         [drawn_chain(chain, calibration[:2], rng)],
         system.priors,
     )
-    noisy.kernel = system.kernel
     return noisy, calibration
 
 
