@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.batch.system import Evaluation, factor_beside, nonlinear_graph
 from pathspace_graph.factors.gtsam_factors import pose_array
+from pathspace_graph.factors.noise import huber_loss
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.variables import POSE, are_poses
 from pathspace_graph.mapping.state import State
@@ -82,6 +83,15 @@ def test_its_linearization_is_ours() -> None:
         turn @ information @ turn.T / np.outer(size, size), expected / np.outer(size, size), atol=1e-7
     )
     np.testing.assert_allclose(turn @ vector / size, negative_gradient / size, atol=1e-6)
+
+
+def test_its_error_is_the_cost_of_the_detections_in_use() -> None:
+    result = solved()
+    system, values = result.system, result.values()
+    at, settings = system.evaluate(result.optimum.state, hold=True), system.settings
+    unused = len(system.detections) - np.isfinite(at.across.sigma).sum()
+    constant = unused * huber_loss(np.array([system.gate]), settings.gate.huber)[0]
+    assert nonlinear_graph(system, at).error(values) == pytest.approx(at.cost - constant, rel=1e-6)
 
 
 def test_its_gradient_vanishes_at_the_optimum() -> None:
