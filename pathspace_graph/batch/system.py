@@ -422,8 +422,15 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
     sigmas = noises.Diagonal.Sigmas(chain.calibration_sigma)
     yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, chain.calibration_mean, sigmas)
     if chain.bias is not None:
-        noise = noises.Diagonal.Precisions(np.array([0.0, chain.bias.sigma**-2]))
-        yield gtsam.PriorFactorPoint2(CALIBRATION_KEY, np.array([0.0, chain.bias.value]), noise)
+        row = gtsam.JacobianFactor(  # an infinite sigma of the scale would make text that GTSAM cannot read
+            CALIBRATION_KEY,
+            np.array([[0.0, 1.0]]),
+            np.array([chain.bias.value - chain.calibration_mean[1]]),
+            noises.Isotropic.Sigma(1, chain.bias.sigma),
+        )
+        about = gtsam.Values()
+        about.insert(CALIBRATION_KEY, np.asarray(chain.calibration_mean))
+        yield gtsam.LinearContainerFactor(row, about)
     sensor_key = at.state.variables.sensor_key
     if sensor_key is not None:
         sigmas = noises.Diagonal.Sigmas(np.array(calibration.sigmas))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from pathspace_graph.batch.system import Evaluation, factor_beside, nonlinear_gr
 from pathspace_graph.factors.gtsam_factors import pose_array
 from pathspace_graph.factors.noise import huber_loss
 from pathspace_graph.factors.se2 import rotation
-from pathspace_graph.graph.variables import POSE, are_poses
+from pathspace_graph.graph.exchange import read_graph, write_graph
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, are_poses
+from pathspace_graph.mapping.motion import BiasMeasurement
 from pathspace_graph.mapping.state import State
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
@@ -92,6 +95,22 @@ def test_its_error_is_the_cost_of_the_detections_in_use() -> None:
     unused = len(system.detections) - np.isfinite(at.across.sigma).sum()
     constant = unused * huber_loss(np.array([system.gate]), settings.gate.huber)[0]
     assert nonlinear_graph(system, at).error(values) == pytest.approx(at.cost - constant, rel=1e-6)
+
+
+def test_a_bias_that_was_measured_at_rest_is_a_factor_that_can_be_written(tmp_path: Path) -> None:
+    system, state = straight()
+    system.chains[0] = replace(system.chains[0], bias=BiasMeasurement(0.001, 0.0005))
+    at, variables = system.evaluate(state, hold=True), state.variables
+    graph, values = nonlinear_graph(system, at), variables.gtsam_values(variables.keys)
+    ordering = variables.layout.ordering
+    information, vector = graph.linearize(values).hessian(ordering)
+    expected, negative_gradient = system.linear_graph(at).hessian(ordering)
+    known = variables.layout.entries(np.array([CALIBRATION_KEY]))
+    np.testing.assert_allclose(information[np.ix_(known, known)], expected[np.ix_(known, known)], rtol=1e-6)
+    np.testing.assert_allclose(vector[known], negative_gradient[known], rtol=1e-6, atol=1e-6)
+    assert graph.error(values) == pytest.approx(2.0)  # the drive is exact, and the bias off by two sigmas
+    write_graph(tmp_path / "graph.json", graph, values)
+    assert read_graph(tmp_path / "graph.json")[0].size() == graph.size()
 
 
 def test_its_gradient_vanishes_at_the_optimum() -> None:
