@@ -110,7 +110,7 @@ def online_command(options: Online) -> Outcome:
         nullcontext()
         if viewing is None
         else viewing.recording(
-            options.save_view, window=options.view, settings=options.recording, truth=log.at_scale_one().truth
+            options.save_view, window=options.view, truth=log.at_scale_one().truth
         ) as recorder
     ):
         observers = [] if recorder is None else [recorder]

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, Self
 
-from pathspace_graph.errors import SettingsError, check_type
+from pathspace_graph.errors import check_type
 from pathspace_graph.labels import Kind
 
 from .checked import Checked, Unlimited
@@ -30,9 +30,6 @@ class SplineSettings(Checked):
     """Distance of neighbouring control points of an open, growing curve, m."""
     size_share: float = 0.43
     """Control points after closing as a share of the distinct cones that were detected (paper: 0.44)."""
-    linear_baseline: float = 0.5
-    """Share of the knots of the paper's filter that is spread evenly along the curve; the others follow its
-    curvature."""
     sigma_model: float = 0.25
     """Standard deviation of a cone's distance from the curve, m, added in each detection. It is larger than
     the offsets, about 0.1 m, since a cone has the same one each time."""
@@ -48,13 +45,6 @@ class SplineSettings(Checked):
     refine_iterations: ClassVar[int] = 1  # Newton steps that refine a foot point in a Gauss-Newton step
     fit_smoothness: ClassVar[float] = 0.1  # weight of second differences in the fit to tentative tracks
     fit_held: ClassVar[int] = 4  # points of the known curve's end that this fit passes, to keep its shape
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.linear_baseline > 1.0:
-            raise SettingsError(
-                f"spline.linear_baseline: expected a share of at most 1, found {self.linear_baseline}"
-            )
 
 
 @dataclass(frozen=True)
@@ -126,8 +116,6 @@ class OpenLapSettings(Checked, group="open_lap"):
     """Cycles after the return at which the batch closes the loop, or as many as the window holds."""
     ends: tuple[int, ...] = ()
     """Cycles in which the batches replace the prior in a replay: `batches.ends` of `summary.json`."""
-    retry: float = 20.0
-    """Least length of path from one batch of the lap to the next, where it does not agree (m)."""
 
 
 @dataclass(frozen=True)
@@ -153,14 +141,6 @@ class BatchSettings(Checked):
 class CkfSettings(Checked):
     """The paper's filters."""
 
-    ridge: float = 0.05
-    """Lambda of the ridge regression, which ties control points to their places (paper: Update)."""
-    sigma_along: float = 1.0
-    """Standard deviation of a cone's distance along the curve from its foot point (m), added likewise."""
-    threshold: float = 4.0
-    """Growth threshold (m): a detection nearer to the end updates the curve instead of extending it."""
-    separation: float = 4.0
-    """Least distance of an extension from the second-to-last control point (m)."""
     sigma_bend: float = 0.5
     """Standard deviation of the second difference of the control points that an extension moves or adds, as a
     share of their spacing. A large value gives the filter as it is published, whose uncertainty multiplies
@@ -168,9 +148,7 @@ class CkfSettings(Checked):
     sightings: int = 3
     """Detections that make a landmark of the baseline filter; its description has 1: every one."""
 
-    sigma_model: ClassVar[float] = (
-        0.25  # m, of a cone's distance from a smooth curve, added in each detection
-    )
+    sigma_model: ClassVar[float] = 0.25  # m, of a cone's distance from a smooth curve, of each detection
 
 
 @dataclass(frozen=True)

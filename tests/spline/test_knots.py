@@ -8,7 +8,6 @@ import yaml
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.settings.mapper import SplineSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import SAMPLED_WEIGHT, LeastSquares, fit_spline
 
@@ -90,8 +89,6 @@ def test_a_fit_to_few_points_does_not_blow_up(count: int, size: int) -> None:
 
 
 def test_settings_out_of_range_are_refused() -> None:
-    with pytest.raises(SettingsError, match="baseline"):
-        SplineSettings(linear_baseline=1.5)
     with pytest.raises(SettingsError, match="too few"):
         fit_spline(np.eye(5)[:, :2], 3, periodic=True)
     with pytest.raises(SettingsError, match="distinct points"):
