@@ -157,8 +157,8 @@ class Boundary:
 
     @property
     def trusted(self) -> float:
-        """Parameter up to which foot points are allowed: beyond it, an open curve is extrapolated."""
-        return np.inf if self.periodic else self.confirmed_end + self.settings.confirmed_margin
+        """Parameter up to which foot points are allowed: half a metre past the last cone of an open curve."""
+        return np.inf if self.periodic else self.confirmed_end + 0.5
 
     @property
     def unseen(self) -> float:
@@ -214,12 +214,13 @@ class Boundary:
         from_u = end if from_u is None else from_u
         kept, held_u = self.settled(old, from_u), np.zeros(0)
         if old:
-            held_u = np.linspace(max(from_u - self.nominal[0], 0.0), from_u, self.settings.fit_held)
+            # four points of the known curve's end keep its shape
+            held_u = np.linspace(max(from_u - self.nominal[0], 0.0), from_u, 4)
             held_u = np.append(held_u, end) if from_u < end else held_u
         values, span = self.tables.evaluate(np.concatenate([held_u, targets_u]))
         columns = self.columns(span)
         first = max(min(int(columns.min()), kept - 2), 0)  # earlier rows have no free column
-        weight, held, bent = self.settings.fit_smoothness, len(held_u), len(columns)
+        weight, held, bent = 0.1, len(held_u), len(columns)  # the weight is that of second differences
         matrix = np.zeros((bent, self.size - first))
         np.put_along_axis(matrix, columns - first, values[0], axis=1)
         matrix = np.concatenate([matrix, weight * smoothness_matrix(self.abscissae[first:], None)])
@@ -297,7 +298,7 @@ def boundaries_cross(splines: Mapping[int, BSpline], step: float, path: Array | 
         return len(found) > 0
     _, kept = np.unique(path_lengths(path) // 1.0, return_index=True)  # of the path, a pose per metre
     level = KDTree(polyline_crossings(path[kept], path[kept], 0.7))  # laps on one road cross at a less sine
-    return bool((level.query(found)[0] >= 8.0).any())  # a road's boundaries cross within 8 m of its middle
+    return bool(np.max(level.query(found)[0]) >= 8.0)  # a road's boundaries cross within 8 m of its middle
 
 
 def polyline_crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
