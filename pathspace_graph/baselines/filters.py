@@ -42,6 +42,7 @@ OVERLAP_ROOM: Final = 4.0  # search range of their foot points on the beginning,
 PERIODIC_STEP: Final = 0.1  # step of the points of an open curve that a closed one is fitted to (m)
 CURVATURE_MAX: Final = 0.7  # limit of the curvature (1/m), so that a kink does not attract all knots
 SAMPLES_PER_BREAK: Final = 40  # samples of the curvature for each break
+SIGMA_SIMPLIFY: Final = 0.1  # of a control point's move by simplification, a looser prior (m)
 LINEAR_BASELINE: Final = 0.5  # share of the knots that is spread evenly; the others follow the curvature
 SEAM_MARGIN: Final = 0.5  # distance before the seam within which a cone belongs to the beginning (m)
 
@@ -294,7 +295,7 @@ def simplify(state: CurveState, observed: Mapping[int, Mapping[int, Array]]) -> 
         foot = boundary.find(known, cones, zero, zero + boundary.confirmed_end)
         boundary.cone_parameters = np.sort(foot.u)
         overlap, curve, change = make_periodic(boundary, known, settings)
-        state.replace(label, curve, change, settings.spline.sigma_simplify)
+        state.replace(label, curve, change, SIGMA_SIMPLIFY)
         state.pose_u[label] = float(overlap.new_parameter(np.array([state.pose_u[label]]))[0])
 
 

@@ -9,9 +9,8 @@ from typing import Annotated, Any, Final, Literal
 from cyclopts import Group, Parameter
 
 from pathspace_graph.settings.checked import Checked
-from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
 from pathspace_graph.settings.evaluation import ScalingSettings
-from pathspace_graph.settings.mapper import MapperSettings, Start
+from pathspace_graph.settings.mapper import BATCH_NAMES, ONLINE_NAMES, MapperSettings, Start
 from pathspace_graph.settings.output import SpeedSettings
 
 INLINE: Final = Parameter(name="*")

@@ -1,7 +1,7 @@
 """Settings of the estimators; a number that nobody changes is a constant, here or beside its use."""
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Final, Literal, Self
 
 from pathspace_graph.errors import check_type
 from pathspace_graph.labels import Kind
@@ -16,6 +16,11 @@ from .online import (
     OdometrySettings,
     SidesSettings,
 )
+
+ONLINE_NAMES: Final = ("fixed-lag", "landmark-fixed-lag", "ckf", "landmark-ckf")
+"""Names of our own online estimators, the default one first."""
+BATCH_NAMES: Final = ("spline", "landmark-batch")
+"""Names of our own batch estimators, the default one first."""
 
 Start = Literal["auto", "online", "odometry"]
 
@@ -37,14 +42,10 @@ class SplineSettings(Checked):
     """Standard deviation of what a curve with few control points cannot follow, m, added in a closed map."""
 
     min_size: ClassVar[int] = 8  # least number of control points of a closed boundary
-    sigma_simplify: ClassVar[float] = 0.1  # m, of a control point's move by simplification: a looser prior
-    confirmed_margin: ClassVar[float] = 0.5  # m past its last cone up to which an open curve is believed
     search_step: ClassVar[float] = 1.0  # m along the curve, of the grid of a global search for foot points
     search_iterations: ClassVar[int] = 2  # Newton steps at the end of that search
     refine_room: ClassVar[float] = 2.0  # m along the curve, of a foot point's move in a Gauss-Newton step
     refine_iterations: ClassVar[int] = 1  # Newton steps that refine a foot point in a Gauss-Newton step
-    fit_smoothness: ClassVar[float] = 0.1  # weight of second differences in the fit to tentative tracks
-    fit_held: ClassVar[int] = 4  # points of the known curve's end that this fit passes, to keep its shape
 
 
 @dataclass(frozen=True)
@@ -79,11 +80,9 @@ class GateSettings(Checked):
 
     view_ahead: ClassVar[float] = 25.0  # m along a curve, of the farthest place ahead that a detection is on
     view_behind: ClassVar[float] = 4.0  # farthest such place behind the vehicle, m
-    chi_unknown: ClassVar[float] = 1.5  # gate of unknown colour, own sigmas: a start line would bend curves
     sigma_floor: ClassVar[float] = 0.1  # m, of errors that the model does not know, added in the gate
     rough: ClassVar[float] = 3.0  # distance from a curve beyond which no detection is associated with it, m
-    station_step: ClassVar[float] = 1.5  # m in a cycle, beyond which the pose's foot point is searched for
-    station_ahead: ClassVar[float] = 8.0  # how far that search goes ahead of the last foot point, m
+    station_ahead: ClassVar[float] = 8.0  # how far a pose's foot point is searched for ahead of the last, m
     station_behind: ClassVar[float] = 3.0  # how far it goes back, m along the curve
     station_lateral: ClassVar[float] = 10.0
     """Distance from a curve at which the vehicle has lost its place, m, as where it leads the other way:
@@ -207,10 +206,6 @@ class MapperSettings(Checked, group=""):
     def sigmas_calibrations(self) -> tuple[float, ...]:
         """Prior standard deviations, (2,) or (7,), of odometry and sensor."""
         return (*self.odometry.sigmas, *self.calibration.sigmas)
-
-
-ODOMETRY_SIGMA = (0.25, 0.12, 0.035)
-"""Standard deviations of a twist (m/s, m/s, rad/s) where none are given; they are the simulator's."""
 
 
 def known_settings(settings: MapperSettings | None) -> MapperSettings:
