@@ -271,30 +271,6 @@ def test_json_lines_hold_polylines(tmp_path: Path) -> None:
     assert main(["convert", str(tmp_path / "drive.jsonl"), *options]) == 2
 
 
-@pytest.mark.parametrize(
-    "entry",
-    [
-        {"scan": {"ranges": [1.0]}},
-        {"scan": {"angle_min": 0.0, "angle_increment": "x", "ranges": [1.0]}},
-        {"scan": [1.0]},
-        {"polylines": [[[0.0, 1.0]]]},
-        {"polylines": [{"points": [[0.0, 1.0, 2.0]]}]},
-    ],
-)
-def test_a_wrong_line_is_named(
-    entry: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    lines = ['{"t": 0.0, "twist": [1.0, 0.0, 0.0]}', json.dumps({"t": 0.1, **entry})]
-    (tmp_path / "drive.jsonl").write_text("\n".join(lines))
-    source = str(tmp_path / "drive.jsonl")
-    assert main(["convert", source, "--from", "jsonl", "--out", str(tmp_path / "log")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert (
-        "row 2: expected a line with t, and with twist [vx, vy, wz], detections, polylines or a scan" in said
-    )
-
-
 def test_points_at_the_sensor_itself_have_a_spacing() -> None:
     scan = Points.of(np.zeros((3, 2)), np.full(3, UNKNOWN), lines=DENSE)
     found = lines_of(np.array([1.0]), scan, AHEAD, Frames(), None, Counter())
