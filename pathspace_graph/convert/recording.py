@@ -558,7 +558,8 @@ def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
     """Which points (m,) are of the polylines nearest to the path on their side, or of none."""
     kept = np.ones(len(lines), bool)
     numbers = np.unique(lines[lines >= 0])
-    middles = np.array([np.nanmedian(lateral[lines == line]) for line in numbers])
+    beside = (lateral[(lines == line) & ~np.isnan(lateral)] for line in numbers)  # empty beyond the path
+    middles = np.array([np.median(own) if len(own) else np.nan for own in beside])
     for side in (1.0, -1.0):
         away = np.where(side * middles > 0.0, side * middles, np.inf)
         far = numbers[(away > 1.5 * away.min(initial=np.inf)) & np.isfinite(away)]

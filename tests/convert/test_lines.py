@@ -181,6 +181,12 @@ def test_of_parallel_markings_the_nearest_ones_bound_the_lane_in_all_their_dashe
     assert found.labels.tolist() == [LEFT] * 6 + [RIGHT] * 6
 
 
+def test_a_polyline_before_the_begin_of_the_path_has_no_side_and_is_kept() -> None:
+    vertices = Points.of([[-4.0, 1.7], [-2.0, 1.7]], np.full(2, UNKNOWN), lines=[0, 0])
+    found = lines_of(np.array([0.0]), vertices, AHEAD, Frames(), 1.0, Counter())
+    assert found.labels.tolist() == [UNKNOWN] * 3
+
+
 def test_a_scan_that_arrives_is_thinned_and_the_estimator_tells_its_sides(messages: Messages) -> None:
     stream = MessageStream()
     for t in (0.0, 0.1):
