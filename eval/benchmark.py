@@ -30,7 +30,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.mapping.motion import integrate_odometry
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import ObservedCycle, run_online, split_odometry, timed_update, timed_wait
-from pathspace_graph.settings.evaluation import ScalingSettings
+from pathspace_graph.settings.evaluation import CONES_MIN, ScalingSettings
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.sensor import LINE, LineSettings, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -172,6 +172,7 @@ DENT, DENTS = 0.12, 3  # share of the radius by which a closed road leaves its c
 DRIVEN, LATERAL = 20.0, 9.0  # speed of the vehicle (m/s) and its largest lateral acceleration (m/s^2)
 STEP: Final = 0.25  # distance of the samples of a road's middle (m)
 SPARE: Final = 1.1  # cones of an open road by those to be seen, since some are never detected
+SEED: Final = 1  # of the drives and of the choice of detections
 JUDGED: Final = 10  # number of updates whose mean is compared with the budget
 QUICK: Final = ScalingSettings(  # takes less than a minute; its slopes mean little
     cones_max=200.0,
@@ -227,18 +228,18 @@ def sweep_drives(sweep: str, settings: ScalingSettings) -> list[tuple[Log, Array
 
     def drive(track: Track, laps: int = 1, **sensing: Any) -> Log:
         vehicle = VehicleSettings(speed_max=DRIVEN, speed_start=DRIVEN, acceleration_lateral=LATERAL)
-        return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, **sensing), settings.seed)
+        return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, **sensing), SEED)
 
     if sweep == CONES:
         log = drive(open_road(int(settings.cones_max), GAP))
         seen = cones_seen(log)
-        edges = np.geomspace(settings.cones_min, settings.cones_max + 1.0, settings.bins + 1)
+        edges = np.geomspace(CONES_MIN, settings.cones_max + 1.0, settings.bins + 1)
         middles = np.concatenate([[np.nan], np.sqrt(edges[:-1] * edges[1:]), [np.nan]])
         count = int(np.searchsorted(seen, settings.cones_max)) + 1
         until_seen = replace(log, cycles=log.cycles[:count], truth=None)
         return [(until_seen, middles[np.searchsorted(edges, seen[:count], side="right")])]
     if sweep == READINGS:
-        road, rng = open_road(settings.readings_cones, DENSE_GAP), np.random.default_rng(settings.seed)
+        road, rng = open_road(settings.readings_cones, DENSE_GAP), np.random.default_rng(SEED)
         dense, drives = drive(road, sensor=SensorSettings(range_max=DENSE_RANGE)), list[tuple[Log, Array]]()
         for wanted in settings.readings:
             cycles = [seen.where(chosen(len(seen.labels), wanted, rng)) for seen in dense.cycles]

@@ -19,7 +19,6 @@ from .errors import PathspaceError, SolveError, check_name, install
 
 PROGRAM: Final = "pathspace-graph"
 DONE, BAD_INPUT, NOT_SOLVED, INTERRUPTED, BROKEN_PIPE, TERMINATED = 0, 2, 3, 130, 141, 143  # exit codes
-MOST_SAID: Final = 400  # characters of a message about the command line, which may hold any word of it
 ASK_COMPLETION: Final = "__complete"  # by which a script of `--completion` asks for names
 HELP_ALL: Final = "--help-all"
 HELP: Final = ("--help", "-h", HELP_ALL)
@@ -77,7 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         name, options = parse(words)
         return DONE if options is None else run_command(name, options)
     except (cyclopts.CycloptsError, PathspaceError) as error:
-        message = str(error) if isinstance(error, PathspaceError) else f"{error!s:.{MOST_SAID}}"
+        # a message about the command line may hold any word of it
+        message = str(error) if isinstance(error, PathspaceError) else f"{error!s:.400}"
         return _refuse(message, words, NOT_SOLVED if isinstance(error, SolveError) else BAD_INPUT)
     except ModuleNotFoundError as error:
         package = str(error.name).partition(".")[0]

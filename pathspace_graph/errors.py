@@ -77,8 +77,6 @@ def install(extra: str) -> str:
 
 
 MAX_INTEGER: Final = 2**63 - 1  # in a file or on the command line
-LEAST_BEGIN: Final = 3  # least number of letters of a prefix that suggests a name
-NAME_SIMILARITY: Final = 0.6  # least similarity (0 to 1) of a suggested name
 
 
 def check_name(name: Any, known: Iterable[str], expected: str) -> None:
@@ -86,8 +84,8 @@ def check_name(name: Any, known: Iterable[str], expected: str) -> None:
     known = list(known)
     if name in known:
         return
-    begins = [one for one in known if len(str(name)) >= LEAST_BEGIN and one.startswith(str(name))]
-    near = begins or get_close_matches(str(name), known, n=1, cutoff=NAME_SIMILARITY)
+    begins = [one for one in known if len(str(name)) >= 3 and one.startswith(str(name))]
+    near = begins or get_close_matches(str(name), known, n=1)
     hint = f", the nearest is '{near[0]}'" if near else ""
     raise SettingsError(f"{expected}, found '{name}'{hint}")
 

@@ -28,8 +28,6 @@ DEFAULT_ONLINE: Final = "fixed-lag"  # online estimator where none is named
 DEFAULT_BATCH: Final = "spline"  # batch estimator where none is named
 ONLINE_GROUP: Final = "pathspace_graph.online"  # group of entry points that add online estimators
 BATCH_GROUP: Final = "pathspace_graph.batch"  # group of entry points that add batch estimators
-PARAMETERS: Final = "Parameters"  # attribute of a maker: a frozen dataclass of its own parameters
-READS: Final = "READS"  # attribute of a maker: the settings that it reads, by field or group; all without it
 ALWAYS_READ: Final = ("kind", "limits", "calibration", "odometry")
 """Settings that are read before an estimator is made, and by what judges its calibration."""
 
@@ -103,8 +101,8 @@ def module_of(name: str) -> str:
 
 
 def parameters_of(name: str) -> Any:
-    """Return the default parameters of an estimator's own, a frozen dataclass; None where it has none."""
-    made_of = getattr(maker_of(name), PARAMETERS, None)
+    """Return the default of the frozen dataclass `Parameters` of a maker; None where it has none."""
+    made_of = getattr(maker_of(name), "Parameters", None)
     return None if made_of is None else made_of()
 
 
@@ -122,8 +120,11 @@ def with_parameters(name: str, overrides: dict[str, Any], where: str = "") -> tu
 
 
 def reads(name: str, field: str) -> bool:
-    """Whether an estimator reads a setting, by its dotted name; one that does not say which reads all."""
-    known = getattr(maker_of(name), "__dict__", {}).get(READS)  # a subclass may read more
+    """Whether an estimator reads a setting, by its dotted name.
+
+    Its maker's `READS` are fields and groups; without it, all are read.
+    """
+    known = getattr(maker_of(name), "__dict__", {}).get("READS")  # a subclass may read more
     return known is None or any(f"{field}.".startswith(f"{own}.") for own in (*ALWAYS_READ, *known))
 
 

@@ -15,14 +15,17 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import left_of
-from pathspace_graph.io import parsing as limits
-from pathspace_graph.io.parsing import Table, is_number, parse_yaml, read_text, shown, typed
+from pathspace_graph.io.parsing import MAX_COORDINATE, Table, is_number, parse_yaml, read_text, shown, typed
 from pathspace_graph.io.tables import read_table
 from pathspace_graph.labels import BIG_ORANGE, UNKNOWN, label_from_name
 from pathspace_graph.labels import ORANGE as SMALL_ORANGE
 
 from .track import Track, arc_lengths, direction, resample, ring, unit
 
+MAX_TRACK_BYTES: Final = 2**23
+MAX_TRACK_LENGTH: Final = 3e4  # m; rows are matched in a time that grows with its square
+MAX_TRACK_WIDTH: Final = 100.0  # m, from the middle of a track to a boundary
+MAX_CONES: Final = 6_000  # of each boundary of a track
 MIN_CONES: Final = 3  # least number of cones of a boundary
 REPEAT_DISTANCE: Final = 0.01  # distance below which a cone of an ordered row is the one before again (m)
 ORANGE: Final = "orange"  # part of PacSim's classes of cones of no boundary
@@ -46,13 +49,13 @@ def read_track(path: Path | str) -> Track:
     if not path.is_file():
         raise InputError(path, f"expected a track file, found {'a folder' if path.is_dir() else 'none'}")
     if path.suffix.lower() in (".yaml", ".yml"):
-        content = parse_yaml(read_text(path, "YAML", limits.MAX_TRACK_BYTES), path)
+        content = parse_yaml(read_text(path, "YAML", MAX_TRACK_BYTES), path)
         if isinstance(content, dict) and isinstance(content.get("track"), dict):
             track = _pacsim(path, content["track"])
         elif isinstance(content, dict) and not {"cones_left", "cones_right"}.isdisjoint(content):
             track = _fssim(path, content)
     elif path.suffix.lower() == ".csv":
-        text = read_text(path, most=limits.MAX_TRACK_BYTES)
+        text = read_text(path, most=MAX_TRACK_BYTES)
         first = next(filter(str.strip, text.split("\n")), "").strip()
         tag, *numbers = (part.strip(' "') for part in first.split(","))
         is_cone = tag.lower() in EUFS_TAGS and len(numbers) >= 2 and all(map(is_number, numbers[:2]))
@@ -94,14 +97,14 @@ def _check(path: Path, track: Track) -> None:
 
 def _check_size(path: Path, row: Array, name: str) -> None:
     length = float(arc_lengths(row)[-1]) if len(row) else 0.0
-    if len(row) > limits.MAX_CONES or length > limits.MAX_TRACK_LENGTH:
-        expected = f"expected at most {limits.MAX_CONES} cones over {limits.MAX_TRACK_LENGTH:g} m as {name}"
+    if len(row) > MAX_CONES or length > MAX_TRACK_LENGTH:
+        expected = f"expected at most {MAX_CONES} cones over {MAX_TRACK_LENGTH:g} m as {name}"
         raise InputError(path, f"{expected}, found {len(row)} over {length:g} m")
 
 
 # --- YAML: PacSim and fssim --------------------------------------------------------------------------------
 
-Number = Annotated[float, Meta(ge=-limits.MAX_COORDINATE, le=limits.MAX_COORDINATE)]
+Number = Annotated[float, Meta(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
 Point = Annotated[list[Number], Meta(min_length=2)]
 Angles = Annotated[list[Number], Meta(min_length=3)]  # also a place with a heading
 
@@ -111,8 +114,8 @@ class _Cone(Struct):
     kind: str | float | bool | None = field(name="class", default="")
 
 
-Cones = Annotated[list[_Cone], Meta(max_length=limits.MAX_CONES)] | None
-Points = Annotated[list[Point], Meta(max_length=limits.MAX_CONES)] | None
+Cones = Annotated[list[_Cone], Meta(max_length=MAX_CONES)] | None
+Points = Annotated[list[Point], Meta(max_length=MAX_CONES)] | None
 
 
 class _Start(Struct):
@@ -180,8 +183,8 @@ def _without_repeats(row: Array, closed: bool) -> Array:
 def _eufs(table: Table) -> Track:
     path, points = table.file, table.stack(("x", "y"))
     tags = np.array([tag.strip().lower() for tag in table.columns["tag"]])
-    if len(points) > 2 * limits.MAX_CONES:
-        raise InputError(path, f"expected at most {2 * limits.MAX_CONES} cones, found {len(points)}")
+    if len(points) > 2 * MAX_CONES:
+        raise InputError(path, f"expected at most {2 * MAX_CONES} cones, found {len(points)}")
     left, right, *others = (
         _without_duplicates(points[tags == tag]) for tag in ("blue", "yellow", *EUFS_OTHER)
     )
@@ -245,8 +248,8 @@ def _tum_circuit(table: Table) -> Array:
     circuit = table.stack(TUM_COLUMNS)
     widths = circuit[:, 2:]
     table.require(np.asarray(widths.min(axis=1) > 0), "expected widths above 0")
-    widest = f"expected widths of at most {limits.MAX_TRACK_WIDTH:g} m"
-    table.require(np.asarray(widths.max(axis=1) <= limits.MAX_TRACK_WIDTH), widest)
+    widest = f"expected widths of at most {MAX_TRACK_WIDTH:g} m"
+    table.require(np.asarray(widths.max(axis=1) <= MAX_TRACK_WIDTH), widest)
     _check_size(table.file, circuit[:, :2], "the middle of the track")
     moved = np.asarray(np.diff(arc_lengths(circuit[:, :2])) > REPEAT_DISTANCE)
     table.require(np.append(True, moved)[: len(circuit)], "expected a point other than the one before")

@@ -7,10 +7,6 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.laps import LapCounter, lap_end_indices
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track_files import read_track
-
-from .scenes.paths import TRACKS
 
 RADIUS = 20.0
 """m; a lap is 125.7 m."""
@@ -84,17 +80,3 @@ def test_a_jump_over_the_line_is_noticed_once() -> None:
 
 def test_sparse_poses_that_leap_the_gate_are_counted() -> None:
     assert count(circle(3.1, step=22.0, radius=80.0)).lap == 4
-
-
-REAL = ["pacsim/FSG19.yaml", "pacsim/FSG21.yaml", "pacsim/FSG24.yaml", "pacsim/FSE22.yaml", "fssim/FSG.yaml"]
-
-
-@pytest.mark.skipif(not TRACKS.is_dir(), reason="the real tracks are not beside this repository")
-@pytest.mark.parametrize("name", [*REAL, "eufs/bone.csv", "eufs/peanut.csv"])
-def test_five_laps_of_a_real_track_are_five(name: str) -> None:
-    log = simulate(read_track(TRACKS / name), SimulationSettings(laps=5), seed=0)
-    assert log.truth is not None
-    ends = lap_end_indices(log.truth.poses)
-    assert len(ends) == 5
-    lengths = np.diff(ends, prepend=0)
-    assert lengths.max() < 1.3 * lengths.min()

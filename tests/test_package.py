@@ -72,14 +72,6 @@ def test_each_folder_with_code_is_imported_as_a_package(folder: Path) -> None:
     assert names == {file.name for file in (ROOT / folder).glob("*.py")}
 
 
-def test_types_are_told_to_users() -> None:
-    assert (ROOT / "pathspace_graph" / "py.typed").is_file()
-
-
-def test_mypy_sees_every_folder() -> None:
-    assert PROJECT["tool"]["mypy"]["files"] == ["pathspace_graph", "examples"]  # it follows links
-
-
 # --- imports ---------------------------------------------------------------------------------------------
 
 

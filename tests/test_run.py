@@ -88,38 +88,6 @@ def test_segments_tile_the_time_with_the_twist_in_force(odometry: list[int], cyc
         since = cycle.t
 
 
-@given(odometry=stamps, cycles=stamps, at=st.integers(0, 11))
-def test_nothing_at_or_after_a_cycle_reaches_it(odometry: list[int], cycles: list[int], at: int) -> None:
-    odometry_t = np.array(odometry) / 4.0
-    cycle_t = np.array([t for t in cycles if t >= odometry[0]]) / 4.0
-    if len(cycle_t) == 0:
-        return
-    log = make_log(odometry_t, cycle_t)
-    at = min(at, len(cycle_t) - 1)
-    twist = log.odometry.twist.copy()
-    twist[odometry_t >= cycle_t[at]] = np.nan
-    blind = replace(log, odometry=Odometry(odometry_t, twist))
-    for number, ((told, _), (known, _)) in enumerate(
-        zip(split_odometry(blind), split_odometry(log), strict=True)
-    ):
-        if number <= at:
-            np.testing.assert_array_equal(told.twist, known.twist)
-
-
-def test_a_cycle_at_the_first_stamp_has_no_odometry() -> None:
-    segments = list(split_odometry(make_log(np.array([2.0, 2.1]), np.array([2.0, 2.1]))))
-    assert len(segments[0][0].t) == 0
-    assert segments[0][0].twist.shape == (0, 3)
-    np.testing.assert_array_equal(segments[1][0].t, [2.0])
-
-
-def test_the_last_twist_is_held_beyond_the_last_stamp() -> None:
-    segments = list(split_odometry(make_log(np.array([0.0, 0.1]), np.array([0.25, 0.5]))))
-    np.testing.assert_array_equal(segments[0][0].t, [0.0, 0.1])
-    np.testing.assert_array_equal(segments[1][0].t, [0.25])
-    np.testing.assert_array_equal(segments[1][0].twist, [[3.0, 4.0, 5.0]])
-
-
 # --- run_online ------------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,6 @@ from scipy.linalg import block_diag
 from pathspace_graph.baselines.ckf_curves import beyond_end, fit_detections, proximity_chain
 from pathspace_graph.baselines.filters import curvature_weighted_breaks
 from pathspace_graph.factors.residuals import greville, smoothness_matrix
-from pathspace_graph.settings.mapper import CkfSettings
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 from pathspace_graph.spline.knots import SAMPLED_WEIGHT, LeastSquares, fit_spline
@@ -90,8 +89,7 @@ before, _ = fit_spline(on_bend(along, -0.03 * (along + 18)), 6, periodic=False)
 sigma_before = posterior(before, np.linspace(*before.domain, 12), 0.5, 1.0)
 detections = on_bend(np.array([-5.5, -2.6, 2.2, 4.6, 7.0]), np.array([0.1, 0.25, 0.3, 0.05, 0.2]))
 foot_u = before.foot_points(detections).u
-ends = CkfSettings(threshold=2.0, separation=2.0)
-beyond = np.flatnonzero(beyond_end(detections, foot_u, before.domain[1], before.control_points, ends))
+beyond = np.flatnonzero(beyond_end(detections, foot_u, before.domain[1], before.control_points, 2.0, 2.0))
 order = beyond[proximity_chain(detections[beyond], before.control_points[-1])]
 
 extended = before.extend_to(detections[order[-1]])
@@ -101,7 +99,7 @@ sigma_extended = block_diag(change @ sigma_before @ change.T, noise)
 others = np.delete(detections, order[-1], axis=0)
 basis = extended.basis_matrix(extended.foot_points(others).u)
 covariances = np.tile(noise, (len(others), 1, 1))
-measured = fit_detections(basis, others, covariances, extended.control_points, CkfSettings())
+measured = fit_detections(basis, others, covariances, extended.control_points)
 combine = np.kron(measured.range_basis(), np.eye(2)).T
 H = combine @ np.kron(measured.taken, np.eye(2))
 R = combine @ measured.covariance @ combine.T
@@ -131,7 +129,7 @@ beside = curve.parameters_at(np.array([0.36, 0.47, 0.58, 0.68]) * curve.length()
 readings = curve.evaluate(beside) + np.array([[0.5], [1.2], [1.3], [0.6]]) * curve.normal_unit(beside)
 basis = curve.basis_matrix(curve.foot_points(readings).u)
 covariances = np.tile(np.diag([0.05, 0.15]), (len(readings), 1, 1))
-measurement = fit_detections(basis, readings, covariances, curve.control_points, CkfSettings())
+measurement = fit_detections(basis, readings, covariances, curve.control_points)
 fitted = curve.with_points(measurement.points)
 
 figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")

@@ -20,7 +20,7 @@ from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.io.files import is_temporary
 from pathspace_graph.io.log import FILES, LOG_FILE, Log
 from pathspace_graph.io.overrides import Overrides, apart, flatten, override
-from pathspace_graph.io.parsing import MAX_HEADER_BYTES, MAX_VARIANTS, parse_toml, read_text, shown
+from pathspace_graph.io.parsing import MAX_HEADER_BYTES, parse_toml, read_text, shown
 from pathspace_graph.plausibility.judge import Hint, read_plausible_log
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import LimitSettings
@@ -39,6 +39,7 @@ RECORDED: Final = "recorded"  # noise of a drive that was not simulated
 TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
 RESOLUTION: Final = 1e-3  # length (m) and angle (rad) to which the geometry of a track identifies it
 ROUNDING: Final = 1.0 / np.pi  # shift that keeps coordinates of few decimals off the edges of millimetres
+MAX_VARIANTS: Final = 10_000  # of the grid of a study
 _LISTS: Final = ("tracks", "seeds", "estimators", "metrics")
 _latest: dict[str, tuple[Log, Sequence[Hint]]] = {}  # the log that was asked for last, by its drive
 

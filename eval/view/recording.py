@@ -24,10 +24,11 @@ from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBounda
 from pathspace_graph.labels import BIG_ORANGE, NAMES
 from pathspace_graph.labels import ORANGE as ORANGE_CONE
 from pathspace_graph.run import ObservedCycle
-from pathspace_graph.settings.output import RecordingSettings
 
 SUFFIX: Final = ".rrd"
 DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")  # one is set with a display, on Linux
+BAND_EVERY: Final = 10  # cycles from one band to the next: each needs the joint covariance of the map
+SAMPLES_PER_SPAN: Final = 6  # lines in each span of a curve
 PORT: Final = 9876  # the viewer's port, rerun's own; a viewer that is there already is used
 
 
@@ -62,7 +63,6 @@ def recording(
     file: Path | str | None = None,
     *,
     window: bool = False,
-    settings: RecordingSettings | None = None,
     truth: Truth | None = None,
 ) -> "Iterator[Recorder]":
     """Yield an observer that records each cycle, and the true cones if known, to a file, a window, or both.
@@ -83,7 +83,7 @@ def recording(
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         stream.set_sinks(*sinks, default_blueprint=blueprint(rerun))
-        yield Recorder(rerun, stream, settings or RecordingSettings(), truth)
+        yield Recorder(rerun, stream, truth)
 
 
 def _open_window(rerun: Any, stream: Any) -> None:
@@ -156,8 +156,8 @@ def blueprint(rerun: Any) -> Any:
 class Recorder:
     """Shows each cycle to a stream of rerun: places and numbers; colours and sizes once, for all times."""
 
-    def __init__(self, rerun: Any, stream: Any, settings: RecordingSettings, truth: Truth | None) -> None:
-        self._rerun, self._stream, self._settings = rerun, stream, settings
+    def __init__(self, rerun: Any, stream: Any, truth: Truth | None) -> None:
+        self._rerun, self._stream = rerun, stream
         self._last_pose: Array | None = None
         self._last_health = Health()
         self._closed = False
@@ -171,7 +171,7 @@ class Recorder:
         self._stream.set_time(TIME, duration=cycle.detections.t)
         self._show_map(cycle.outline)
         replaced = cycle.result.jump is not None or cycle.result.closed != self._closed
-        if cycle.number % self._settings.band_every == 0 or replaced:
+        if cycle.number % BAND_EVERY == 0 or replaced:
             for label, boundary in cycle.map.boundaries.items():
                 self._lines(_path(label, "band"), self._band(boundary))
         self._lines(VEHICLE, [to_map(OUTLINE, np.tile(pose, (len(OUTLINE), 1)))])
@@ -238,7 +238,7 @@ class Recorder:
             if isinstance(boundary, PointBoundary):
                 self._points(_path(label, "points"), boundary.points)
                 continue
-            u = style.curve_parameters(boundary.spline, self._settings.samples_per_span)
+            u = style.curve_parameters(boundary.spline, SAMPLES_PER_SPAN)
             until = boundary.confirmed_until
             confirmed, tentative = u[u <= until], u[u > until]
             if len(tentative):
@@ -249,7 +249,7 @@ class Recorder:
 
     def _band(self, boundary: MapBoundary) -> list[Array]:
         if isinstance(boundary, SplineBoundary):
-            u = style.curve_parameters(boundary.spline, self._settings.samples_per_span)
+            u = style.curve_parameters(boundary.spline, SAMPLES_PER_SPAN)
             return list(style.uncertainty_band(boundary, u))
         return list(style.ellipse_outlines(boundary.points, boundary.covariance))
 

@@ -17,13 +17,17 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, UNKNOWN
 from pathspace_graph.mapping import path
 from pathspace_graph.mapping.path import END_BEHIND, SIDES, Candidates, End, PathAhead, chain
-from pathspace_graph.mapping.tracks import Tracks, nearest_within
-from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
+from pathspace_graph.mapping.tracks import FORGET_AFTER, Tracks, nearest_within
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
 from .ckf_belief import SENSOR_COLUMNS, Belief, point_columns, to_vehicle_rows, transform
 
+RIDGE: Final = 0.05  # lambda of the ridge regression, which ties control points to their places
+SIGMA_ALONG: Final = 1.0  # standard deviation of a cone's distance along the curve from its foot point (m)
+GROWTH_THRESHOLD: Final = 4.0  # distance from the end below which a detection updates the curve only (m)
+SEPARATION: Final = 4.0  # least distance of an extension from the second-to-last control point (m)
 SIGMA_START: Final = 0.3  # added standard deviation of a new curve's control points (m)
 
 
@@ -161,7 +165,7 @@ class Expansion:
 
     def __init__(self, settings: MapperSettings) -> None:
         self.settings = settings
-        self.tentative = Tracks(settings.growth.merge_radius, settings.growth.forget_after)
+        self.tentative = Tracks(settings.growth.merge_radius, FORGET_AFTER)
         self.observed: dict[int, dict[int, Array]] = {label: {} for label in BOUNDARIES}
         """Confirmed cones, as points (2,) in m, map frame, by label and number of their track."""
         self._carried = dict.fromkeys(BOUNDARIES, 0.0)  # extrapolated lengths since the last cone (m)
@@ -218,7 +222,7 @@ class Expansion:
         low, _ = state.visible_range(label, len(found.points))
         foot = state.foot_points(label, found.points, np.minimum(low, high), np.full(len(low), high))
         ahead = found.stations > end.station + path.STATION_MARGIN
-        return ahead & beyond_end(found.points, foot.u, high, control_points, self.settings.ckf)
+        return ahead & beyond_end(found.points, foot.u, high, control_points)
 
     def _extend(self, state: CurveState, label: int, detections: Detections, found: Candidates) -> bool:
         """Extend a curve to the last candidate of the proximity chain; return whether there is one."""
@@ -231,7 +235,7 @@ class Expansion:
         for i in range(len(rows)):
             final = i == len(rows) - 1
             too_far = not final and np.hypot(*(points[i + 1] - last)) > LONGEST_EXTENSION
-            if final or (too_far and np.hypot(*(points[i] - last)) > self.settings.ckf.threshold):
+            if final or (too_far and np.hypot(*(points[i] - last)) > GROWTH_THRESHOLD):
                 state.extend(label, detections.points_vehicle[rows[i]], covariances[i])
                 last = points[i]
         return True
@@ -258,7 +262,12 @@ class Expansion:
 
 
 def beyond_end(
-    points: Array, u: Array, high: float, control_points: Array, settings: CkfSettings
+    points: Array,
+    u: Array,
+    high: float,
+    control_points: Array,
+    threshold: float = GROWTH_THRESHOLD,
+    separation: float = SEPARATION,
 ) -> BoolArray:
     """Whether points (m, 2) with foot points u (m,) meet the paper's three conditions of growth.
 
@@ -266,8 +275,8 @@ def beyond_end(
     from `C_{n-1}` exceeds the separation.
     """
     at_end = u >= high - END_TOLERANCE_U
-    far = np.hypot(*(points - control_points[-1]).T) > settings.threshold
-    apart = np.hypot(*(points - control_points[-2]).T) > settings.separation
+    far = np.hypot(*(points - control_points[-1]).T) > threshold
+    apart = np.hypot(*(points - control_points[-2]).T) > separation
     return np.asarray(at_end & far & apart)
 
 
@@ -369,26 +378,24 @@ class SplineMeasurement:
         return np.asarray(vectors[:, values > GAIN_RANK * values[0]])
 
 
-def regularization(basis: Array, settings: CkfSettings) -> Array:
+def regularization(basis: Array) -> Array:
     """Regularization `L = lambda diag(1 - B' 1 / m)` (r, r) for a basis B (m, r)."""
-    return np.diag(settings.ridge * (1.0 - basis.mean(axis=0)))
+    return np.diag(RIDGE * (1.0 - basis.mean(axis=0)))
 
 
-def ridge_gain(basis: Array, settings: CkfSettings) -> Array:
+def ridge_gain(basis: Array) -> Array:
     """Gain `G = (B' B + L)^-1 B'` (r, m) of the ridge regression `C = C_mu + G (y - B C_mu)`."""
-    gram = basis.T @ basis + regularization(basis, settings)
+    gram = basis.T @ basis + regularization(basis)
     return np.asarray(np.linalg.lstsq(gram, basis.T, rcond=None)[0])
 
 
-def fit_detections(
-    basis: Array, detections: Array, covariances: Array, known: Array, settings: CkfSettings
-) -> SplineMeasurement:
+def fit_detections(basis: Array, detections: Array, covariances: Array, known: Array) -> SplineMeasurement:
     """Fit S_z to detections (m, 2) with covariances (m, 2, 2), by a cubature transform of ridge regression.
 
     basis (m, r) is evaluated at their foot points; known (r, 2) are the control points in their frame.
     """
     m, r = basis.shape
-    gain = ridge_gain(basis, settings)
+    gain = ridge_gain(basis)
     joint = np.zeros((m, 2, m, 2))
     joint[np.arange(m), :, np.arange(m), :] = covariances
     kept = known - gain @ (basis @ known)
@@ -439,11 +446,11 @@ def _fit(state: CurveState, label: int, detections: Detections, on: OnCurve) -> 
     """
     control = np.flatnonzero(on.basis.sum(axis=0) > LEAST_BASIS)
     known = to_vehicle_rows(state.pose[None], state.control_points(label)[control].reshape(1, -1))
-    ckf, points = state.settings.ckf, detections.points_vehicle[on.rows]
+    points = detections.points_vehicle[on.rows]
     t = on.tangents @ rotation(state.pose[2])
-    along = ckf.sigma_along**2 * t[:, :, None] * t[:, None, :]
-    covariances = detections.covariances[on.rows] + ckf.sigma_model**2 * np.eye(POINT) + along
-    fitted = fit_detections(on.basis[:, control], points, covariances, known.reshape(-1, POINT), ckf)
+    along = SIGMA_ALONG**2 * t[:, :, None] * t[:, None, :]
+    covariances = detections.covariances[on.rows] + state.settings.ckf.sigma_model**2 * np.eye(POINT) + along
+    fitted = fit_detections(on.basis[:, control], points, covariances, known.reshape(-1, POINT))
     combinations: Array = np.asarray(np.kron(fitted.range_basis(), np.eye(POINT)), float)
     expected = state.belief.by_sensor(on.basis[:, control] @ fitted.known)
     by_calibration = np.einsum("rm,mik->rik", fitted.gain, expected).reshape(-1, SENSOR_SIZE)

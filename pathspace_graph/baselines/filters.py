@@ -18,7 +18,7 @@ from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.tracks import Tracks, nearest_within
+from pathspace_graph.mapping.tracks import FORGET_AFTER, Tracks, nearest_within
 from pathspace_graph.places.constellation import BEGINNING, Constellation, Prior, SampledCurves, beginning_of
 from pathspace_graph.places.find import find, sure
 from pathspace_graph.places.passes import tried_along
@@ -42,6 +42,8 @@ OVERLAP_ROOM: Final = 4.0  # search range of their foot points on the beginning,
 PERIODIC_STEP: Final = 0.1  # step of the points of an open curve that a closed one is fitted to (m)
 CURVATURE_MAX: Final = 0.7  # limit of the curvature (1/m), so that a kink does not attract all knots
 SAMPLES_PER_BREAK: Final = 40  # samples of the curvature for each break
+SIGMA_SIMPLIFY: Final = 0.1  # of a control point's move by simplification, a looser prior (m)
+LINEAR_BASELINE: Final = 0.5  # share of the knots that is spread evenly; the others follow the curvature
 SEAM_MARGIN: Final = 0.5  # distance before the seam within which a cone belongs to the beginning (m)
 
 
@@ -71,7 +73,7 @@ def make_periodic(
     u = np.arange(0.0, period, LINE_STEP) if settings.of_lines else u
     u = _apart(u[u < period - SEAM_MARGIN], settings.growth.merge_radius)
     size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
-    breaks = curvature_weighted_breaks(spline, size, settings.spline.linear_baseline, 0.0, period)
+    breaks = curvature_weighted_breaks(spline, size, LINEAR_BASELINE, 0.0, period)
     frame = BSpline.periodic_from(breaks, np.zeros((len(breaks) - 1, 2)), boundary.degree)
     u = np.linspace(*spline.domain, int(boundary.length / PERIODIC_STEP) + 1)
     fit = LeastSquares(frame, overlap.new_parameter(u), SAMPLED_WEIGHT)
@@ -293,7 +295,7 @@ def simplify(state: CurveState, observed: Mapping[int, Mapping[int, Array]]) -> 
         foot = boundary.find(known, cones, zero, zero + boundary.confirmed_end)
         boundary.cone_parameters = np.sort(foot.u)
         overlap, curve, change = make_periodic(boundary, known, settings)
-        state.replace(label, curve, change, settings.spline.sigma_simplify)
+        state.replace(label, curve, change, SIGMA_SIMPLIFY)
         state.pose_u[label] = float(overlap.new_parameter(np.array([state.pose_u[label]]))[0])
 
 
@@ -313,7 +315,7 @@ class LandmarkCkf(_Filter):
         super()._begin()
         self.labels: IntArray = np.zeros(0, np.intp)  # (n,) labels of the landmarks
         growth = self.settings.growth
-        self.tentative = Tracks(growth.merge_radius, growth.forget_after)
+        self.tentative = Tracks(growth.merge_radius, FORGET_AFTER)
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
         self.belief.follow(reading.motion)

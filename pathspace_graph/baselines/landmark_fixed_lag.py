@@ -21,7 +21,7 @@ from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.mapping import motion as motions
 from pathspace_graph.mapping.motion import predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
-from pathspace_graph.mapping.tracks import Tracks, nearest_within
+from pathspace_graph.mapping.tracks import FORGET_AFTER, Tracks, nearest_within
 from pathspace_graph.run import CycleResult, Readings, Stopwatch
 
 from . import landmark_association as association
@@ -59,7 +59,7 @@ class LandmarkFixedLag(OnlineBaseline):
         self.smoother.window.exact = True
         self.path = DrivenPath()
         growth = self.settings.growth
-        self.tentative = Tracks(growth.merge_radius, growth.forget_after)
+        self.tentative = Tracks(growth.merge_radius, FORGET_AFTER)
         self.inflated = self.settings  # settings with the present priors of the calibrations
         self.closed = False
         self.record = DriveRecord()

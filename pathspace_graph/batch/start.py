@@ -24,6 +24,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
+from pathspace_graph.mapping.growth import GROWTH_REACH
 from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
 from pathspace_graph.mapping.state import State
 from pathspace_graph.places.passes import (
@@ -251,7 +252,7 @@ def _begin_boundary(
     if len(rows) == 0 or first_lap.sum() < 2:
         return
     cycles, path, stations = detections.cycle[rows], poses[first_lap, :2], driven[first_lap]
-    length = float(stations[-1]) + settings.growth.reach
+    length = float(stations[-1]) + GROWTH_REACH
     if closes:
         length, path = lap, np.concatenate([path, path[:1]])
         stations = np.append(stations, length)

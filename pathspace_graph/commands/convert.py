@@ -1,6 +1,5 @@
 """`convert`: a ROS bag, CSV files or JSON lines as a log."""
 
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -32,7 +31,6 @@ from .estimate import tell
 from .outcome import Outcome
 from .simulate import describe
 
-SUFFIXES: Final = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json")}  # of records in a folder
 OF_KIND: Final = {  # kinds of records that take an option; any other option is for all of them
     **dict.fromkeys(("odometry", "detections"), ("bag", "csv")),
     **dict.fromkeys(("imu", "wheelbase", "definition", "received", "namespaces", "label_field"), ("bag",)),
@@ -72,12 +70,14 @@ def _records(options: Convert) -> list[Path]:
     if options.kind == "csv":
         file = options.topics.odometry or ODOMETRY_FILE
         return [] if (folder / file).exists() else sorted(one.parent for one in folder.glob(f"*/{file}"))
-    known = [one for one in folder.iterdir() if one.suffix in SUFFIXES.get(options.kind, ())]
+    suffixes = {"bag": (".bag", ".mcap", ".db3"), "jsonl": (".jsonl", ".json")}[options.kind]
+    known = [one for one in folder.iterdir() if one.suffix in suffixes]
     bags = [one.parent for one in folder.glob("*/metadata.yaml")] if options.kind == "bag" else []
     return sorted({*known, *bags})
 
 
 def _convert(options: Convert, source: Path, out: Path) -> None:
+    """Convert a record and report it; InputError of the source where an estimator could not use its log."""
     check_target(out, LOG_FILE, force=options.force)
     rule = LabelRule(options.labels, options.label_field)
     with progress("converting"):
@@ -90,8 +90,30 @@ def _convert(options: Convert, source: Path, out: Path) -> None:
         record = windowed(read, options.window, source)
         recorded = to_log(record, options.frames, options.noise, source, options.window.spacing)
         log = with_measured_noise(replace(recorded, scale=options.scale), record.parts)
-        write_checked(log, out, source, force=options.force)
-    tell_log(record.notes, rule, log)
+        try:
+            check_usable(log, out, LimitSettings())
+            write_log(log, out, check=True, force=options.force)
+        except InputError as error:  # an estimator could not use it
+            where = f"{error.file.name}, row {error.row}" if error.row else error.file.name
+            likely = because(hints(log))
+            why = f"{error.message}; {likely}" if likely else error.message
+            part = "--start and --end take a part of the record"
+            raise InputError(source, f"its log would be refused ({where}): {why}; {part}") from None
+    # what was dropped or assumed and how often, labels, rates, speeds, ranges and the length
+    twists, seconds = log.odometry.twist, float(np.ptp(log.odometry.t))
+    ranges = np.concatenate([np.hypot(*cycle.points_vehicle.T) for cycle in log.cycles])
+    labels = np.bincount(np.concatenate([cycle.labels for cycle in log.cycles]), minlength=len(NAMES))
+    counted = [f"{count} {name}" for name, count in zip(NAMES, labels.tolist(), strict=True) if count]
+    measured = [] if log.measured is None else [measured_line(scaled(log.measured, 1.0 / log.scale))]
+    say(
+        *(f"{count} {text}" for text, count in record.notes.items() if count),
+        *([rule.summary()] if rule.met else []),
+        f"odometry at {rate(len(twists), seconds)}, up to {np.hypot(*twists[:, :2].T).max():.3g} m/s and "
+        f"{np.abs(twists[:, 2]).max():.3g} rad/s; detections at {rate(len(log.cycles), seconds)}, "
+        f"{ranges.min():.3g} m to {ranges.max():.3g} m away: {', '.join(counted)}",
+        *measured,
+        describe(log),
+    )
     tell(hints(log))
 
 
@@ -123,35 +145,4 @@ def with_measured_noise(log: Log, parts: int = 1) -> Log:
     known = ((cycle, measured.covariances(cycle.points_vehicle, inflated=False)) for cycle in log.cycles)
     return replace(
         log, cycles=tuple(cycle if K is None else replace(cycle, covariances=K) for cycle, K in known)
-    )
-
-
-def write_checked(log: Log, out: Path, source: Path, *, force: bool) -> None:
-    """Write a log; InputError of its source where an estimator could not use it."""
-    try:
-        check_usable(log, out, LimitSettings())
-        write_log(log, out, check=True, force=force)
-    except InputError as error:
-        where = f"{error.file.name}, row {error.row}" if error.row else error.file.name
-        likely = because(hints(log))
-        why = f"{error.message}; {likely}" if likely else error.message
-        part = "--start and --end take a part of the record"
-        raise InputError(source, f"its log would be refused ({where}): {why}; {part}") from None
-
-
-def tell_log(notes: Counter[str], rule: LabelRule, log: Log) -> None:
-    """Print what was dropped or assumed and how often, labels, rates, speeds, ranges and the length."""
-    twists, seconds = log.odometry.twist, float(np.ptp(log.odometry.t))
-    ranges = np.concatenate([np.hypot(*cycle.points_vehicle.T) for cycle in log.cycles])
-    labels = np.bincount(np.concatenate([cycle.labels for cycle in log.cycles]), minlength=len(NAMES))
-    counted = [f"{count} {name}" for name, count in zip(NAMES, labels.tolist(), strict=True) if count]
-    measured = [] if log.measured is None else [measured_line(scaled(log.measured, 1.0 / log.scale))]
-    say(
-        *(f"{count} {text}" for text, count in notes.items() if count),
-        *([rule.summary()] if rule.met else []),
-        f"odometry at {rate(len(twists), seconds)}, up to {np.hypot(*twists[:, :2].T).max():.3g} m/s and "
-        f"{np.abs(twists[:, 2]).max():.3g} rad/s; detections at {rate(len(log.cycles), seconds)}, "
-        f"{ranges.min():.3g} m to {ranges.max():.3g} m away: {', '.join(counted)}",
-        *measured,
-        describe(log),
     )

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
 from itertools import count
@@ -50,22 +50,15 @@ from .outcome import Outcome
 Run = TypeVar("Run", bound=RunResult)
 
 
-@dataclass(frozen=True, eq=False)
-class KnownTrack:
-    """A map that is known before the drive."""
-
-    map: Map
-    start: Array | None  # pose (3,) at the begin of an open one (m, m, rad), map frame; None of a closed one
-
-
-def read_known_map(path: Path, sigma: float, settings: MapperSettings) -> KnownTrack:
+def read_known_map(path: Path, sigma: float, settings: MapperSettings) -> tuple[Map, Array | None]:
     """Read the map of a folder, of a track file, or of an event of the rules.
 
-    Cones of a track file or of an event are known with a standard deviation `sigma` (m).
+    Cones of a track file or of an event are known with a standard deviation `sigma` (m). The second result is
+    the pose (3,) at the begin of an open track, None of a closed one.
     """
     if path.is_dir() or path.name == MAP_FILE:
         track = read_map(path)
-        return KnownTrack(track, None if track.closed else np.zeros(3))
+        return track, None if track.closed else np.zeros(3)
     if not path.exists() and str(path) in EVENTS:
         drawn = EVENTS[str(path)]()
     elif path.exists():
@@ -74,7 +67,7 @@ def read_known_map(path: Path, sigma: float, settings: MapperSettings) -> KnownT
         events = " or ".join(EVENTS)
         raise InputError(path, f"expected a map's folder, a track file, {events}, found none")
     track = map_of_cones(*drawn.rows, drawn.closed, sigma, settings)
-    return KnownTrack(track, None if drawn.closed else drawn.start)
+    return track, None if drawn.closed else drawn.start
 
 
 def online_command(options: Online) -> Outcome:
@@ -100,17 +93,17 @@ def online_command(options: Online) -> Outcome:
     if known is None:
         estimator = estimators.make_online(options.estimator, options.settings, log, parameters)
     else:
-        settings, start = estimators.settings_of(options.settings, log), known.start
+        settings, start = estimators.settings_of(options.settings, log), known[1]
         start = start if options.start is None else np.array(options.start)
         start = None if start is None else start / np.array([log.scale, log.scale, 1.0])
-        track = scaled(known.map, 1.0 / log.scale)
+        track = scaled(known[0], 1.0 / log.scale)
         estimator = FixedLagMapper.on(track, settings, log.noise, start=start, keep=options.keep_map)
         log = replace(log, truth=None)  # it is in another frame
     with (
         nullcontext()
         if viewing is None
         else viewing.recording(
-            options.save_view, window=options.view, settings=options.recording, truth=log.at_scale_one().truth
+            options.save_view, window=options.view, truth=log.at_scale_one().truth
         ) as recorder
     ):
         observers = [] if recorder is None else [recorder]
@@ -119,7 +112,7 @@ def online_command(options: Online) -> Outcome:
         summarized, changes = summarize(result, log, hints), list[MapDifference]()
         found_at = estimator.placed_at if isinstance(estimator, FixedLagMapper) else None
         if known is not None and found_at is not None:
-            before = scaled(known.map, 1.0 / result.scale)
+            before = scaled(known[0], 1.0 / result.scale)
             found = differences(before, result.at_scale_one().map)
             changes = [scaled(one, result.scale) for one in found]
         if known is not None:

@@ -91,6 +91,7 @@ def export_graph(file: Path, form: str, out: Path) -> Outcome:
         raise InputError(file, "expected a factor graph, which batch --graph writes, found none")
     try:
         graph, values = read_graph(file, "pose_graph" if form == "g2o" else "graph")
+        whole = read_graph(file)[0].size() if form == "g2o" else 0
     except (KeyError, RuntimeError, ValueError) as error:
         raise InputError(file, f"expected a factor graph of batch --graph, found {error!r}") from error
     with atomic_file(out) as temporary:
@@ -101,6 +102,6 @@ def export_graph(file: Path, form: str, out: Path) -> Outcome:
         else:
             write_g2o(temporary, graph, values)
     if form == "g2o":
-        left_out = read_graph(file)[0].size() - graph.size()
+        left_out = whole - graph.size()
         note(f"g2o holds poses and what relates two of them: {left_out} other factors are left out")
     return Outcome([out])

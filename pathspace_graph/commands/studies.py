@@ -26,9 +26,16 @@ from .outcome import Outcome
 def execute(
     options: StudyCommand, study: Study, write: Callable[[Study, pd.DataFrame, Path], str]
 ) -> Outcome:
-    """Check and run a study, `write` it and print the text of it."""
+    """Run a study with the drives of the options, `write` it and print the text of it."""
     check_jobs(options.jobs)
-    study = with_drives(study, options)
+    if options.laps is not None and options.laps < 1:
+        raise SettingsError(f"--laps: expected at least 1, found {options.laps}")
+    tracks = tuple(int(track) if track.isdecimal() else Path(track) for track in options.tracks)
+    logs = {name: (folder,) for path in options.logs for name, folder in log_folders(path).items()}
+    if tracks or logs:
+        study = replace(study, tracks=tracks, logs=logs)
+    chosen: dict[str, Any] = {"seeds": options.seeds, "laps": options.laps}
+    study = replace(study, **{name: value for name, value in chosen.items() if value})
     plan = make_plan(study, keep=options.keep)
     if stale := of_other_code(options.out, plan.cells):
         note(f"{stale} runs in {options.out} are of other code, and are not used")
@@ -40,18 +47,6 @@ def execute(
     failures = frame[frame["failure"] != ""]["failure"].tolist()
     wrong = [f"{len(failures)} of {len(plan.cells)} cells failed, the first of {one}" for one in failures[:1]]
     return Outcome([options.out], {"cells": len(plan.cells), "failures": failures}, wrong)
-
-
-def with_drives(study: Study, given: StudyCommand) -> Study:
-    """Replace tracks (files, or seeds of generated ones), logs, seeds and laps of a study."""
-    if given.laps is not None and given.laps < 1:
-        raise SettingsError(f"--laps: expected at least 1, found {given.laps}")
-    tracks = tuple(int(track) if track.isdecimal() else Path(track) for track in given.tracks)
-    logs = {name: (folder,) for path in given.logs for name, folder in log_folders(path).items()}
-    if tracks or logs:
-        study = replace(study, tracks=tracks, logs=logs)
-    chosen: dict[str, Any] = {"seeds": given.seeds, "laps": given.laps}
-    return replace(study, **{name: value for name, value in chosen.items() if value})
 
 
 def ablate_command(options: Ablate) -> Outcome:

@@ -38,27 +38,14 @@ class Samples(NamedTuple):
     numbers: Any  # (N,) number of each message in its topic, from 1
 
 
-class Motion(NamedTuple):
-    """Motion of the vehicle in a message."""
-
-    twist: Array | None  # (3,) twist in m/s, m/s and rad/s, NaN where it is not known
-    pose: Array | None  # (3,) pose in m, m and rad
-    world: str  # frame of the pose
-    body: str  # frame of the twist
-
-
 def read_bag(path: Path, options: Topics, rule: LabelRule, *, mounted: bool = False) -> Recording:
     """Read the drive in the topics of a bag; `mounted` says that the sensor's pose was stated."""
     notes, namespaces = Counter[str](), Counter[str]()
 
-    def motion(message: Any) -> Motion:
-        twist = messages.twist_of(message, options.wheelbase)
-        return Motion(
-            twist,
-            messages.pose_of(message),
-            messages.frame_id_of(message),
-            messages.frame_id_of(message, "child_frame_id"),
-        )
+    def motion(message: Any) -> tuple[Array | None, Array | None, str, str]:
+        twist, pose = messages.twist_of(message, options.wheelbase), messages.pose_of(message)
+        body = messages.frame_id_of(message, "child_frame_id")  # of the twist
+        return twist, pose, messages.frame_id_of(message), body
 
     def points(message: Any) -> tuple[str, Points]:
         namespaces.update(marker.ns for marker in messages.added(getattr(message, "markers", ())))
@@ -79,8 +66,8 @@ def read_bag(path: Path, options: Topics, rule: LabelRule, *, mounted: bool = Fa
         notes[told] += len(namespaces)
     if imu is not None:
         check_clock(imu.t, "the IMU", path)
-    twists = np.array([one.twist for one in odometry.values if one.twist is not None])
-    poses = np.array([one.pose for one in odometry.values if one.pose is not None])
+    twists = np.array([twist for twist, *_ in odometry.values if twist is not None])
+    poses = np.array([pose for _, pose, *_ in odometry.values if pose is not None])
     moved, are_poses = chosen_motion(
         twists if len(twists) else None,
         poses if len(poses) == len(odometry.values) else None,
@@ -117,14 +104,14 @@ def _mounting(
     odometry: Samples, detections: Samples, static: list[Any], notes: Counter[str], path: Path
 ) -> tuple[float, float, float] | None:
     """Find the sensor's pose in the bag's transforms; refuse detections in the world's frame."""
-    first, frames = odometry.values[0], {frame for frame, _ in detections.values} - {""}
-    if first.pose is not None and first.body and first.world in frames - {first.body}:
-        expected = f"expected detections in a frame of the vehicle, such as {first.body}"
-        found = f"found them in {first.world}, the frame of its pose"
+    (_, pose, world, body), frames = odometry.values[0], {frame for frame, _ in detections.values} - {""}
+    if pose is not None and body and world in frames - {body}:
+        expected = f"expected detections in a frame of the vehicle, such as {body}"
+        found = f"found them in {world}, the frame of its pose"
         otherwise = "--mounting 0 0 0 takes them as in the vehicle frame"
         raise InputError(path, f"{detections.name}: {expected}, {found}; {otherwise}")
     named = {one.header.frame_id.lstrip("/") for one in static}
-    body = first.body or next((name for name in ("base_link", "base_footprint") if name in named), "")
+    body = body or next((name for name in ("base_link", "base_footprint") if name in named), "")
     others = sorted(frames - {body})
     if not body or not others:
         return None
@@ -300,7 +287,6 @@ class Bag:
 MCAP: Final = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL = 1, 2, 3, 4  # kinds of records of an MCAP file
 FOOTER_BYTES: Final = 37  # of the last record of an MCAP file with what is around it
-MOST_NAMED: Final = 8  # number of topics that are named
 KINDS: Final = {  # kind of a file, by its first bytes
     b"#ROSBAG": "a bag of ROS 1 that is damaged or was cut off",
     b"SQLite format 3": "an SQLite database that is no bag, is damaged or was cut off",
@@ -316,9 +302,7 @@ def described(path: Path) -> str:
     """Say what a file, or each file of a folder, holds that is no bag."""
     if path.is_dir():
         files = sorted(file for file in path.iterdir() if file.is_file() and file.name != "metadata.yaml")
-        return (
-            "; ".join(f"{file.name}, {described(file)}" for file in files[:MOST_NAMED]) or "an empty folder"
-        )
+        return "; ".join(f"{file.name}, {described(file)}" for file in files[:8]) or "an empty folder"
     with path.open("rb") as stream:
         begin = stream.read(len(MCAP))
         if begin == MCAP:
@@ -351,7 +335,7 @@ def described_mcap(stream: BinaryIO) -> str:
                 topic, encoding = _text(record), _text(record)
                 topics[topic] = schemas.get(key, "no schema"), encoding
     named = [f"{topic} ({schema})" for topic, (schema, _) in sorted(topics.items())]
-    listed = ", ".join(named[:MOST_NAMED]) + ", ..." * (len(named) > MOST_NAMED)
+    listed = ", ".join(named[:8]) + ", ..." * (len(named) > 8)
     encodings = " and ".join(sorted({encoding for _, encoding in topics.values()}))
     if profile == "ros2" and encodings == "cdr":
         return "an MCAP file of ROS 2 that is damaged"

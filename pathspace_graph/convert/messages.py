@@ -83,9 +83,8 @@ class Points(NamedTuple):
 
 def header_of(message: Any) -> Any:
     """Header of a message, of the first point of an array of markers, or None."""
-    if hasattr(message, "markers"):
-        return next((marker.header for marker in added(message.markers)), None)
-    return getattr(message, "header", None)
+    first = next(added(message.markers), None) if hasattr(message, "markers") else message
+    return getattr(first, "header", None)
 
 
 def stamp_of(message: Any) -> float | None:
@@ -248,8 +247,7 @@ def cone_points(message: Any, rule: LabelRule) -> Points:
     has its own. Its covariance has 4 (x, y), 9 (x, y, z) or 36 entries (a pose), row by row. What has a list
     of points in place of a position is a polyline.
     """
-    lists = _lists(message)
-    if not lists:
+    if not (lists := _lists(message)):
         raise MessageError(f"expected a message with a list of cones, found the fields {_names(message)}")
     points, covariances = list[tuple[float, float]](), list[Array]()
     labels, numbers = list[int](), list[int]()

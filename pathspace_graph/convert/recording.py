@@ -23,13 +23,10 @@ from pathspace_graph.settings.online import LimitSettings
 from .messages import ALONE, Points
 from .settings import LEAST_SPACING, Frames, NoiseSettings, Window
 
-MAX_DISORDER: Final = 2.0  # largest fall of stamps (s) from one message to the next of one clock
-MOST_PLACES: Final = 5  # number of rows that are named
 APART: Final = 1e6  # distance (m) of two messages where places are compared; no detection is as far
 # notes of what was done
 ASSUMED: Final = "detections had no covariance that can be used, and were given one"
 OUTSIDE: Final = "messages with detections outside the time of the odometry were left out"
-SHARED: Final = "messages with detections are at most 1 ms after another one, and are one cycle with it"
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +66,7 @@ class Recording:
 
     def at(self, rows: IntArray) -> str:
         """Say where rows of the odometry are."""
-        told = ", ".join(map(str, rows[:MOST_PLACES].tolist()))
-        return f"{self.place} {told}{', ...' * (len(rows) > MOST_PLACES)}"
+        return f"{self.place} {', '.join(map(str, rows[:5].tolist()))}{', ...' * (len(rows) > 5)}"
 
 
 def chosen_motion(
@@ -96,13 +92,13 @@ def check_clock(t: Array, what: str, file: Path) -> None:
     """Raise an InputError where stamps (n,) in s fall back since the clock was reset.
 
     Two messages before it and two from it on agree, unlike those of a stray stamp. Messages out of order fall
-    by less than `MAX_DISORDER`.
+    by less than 2 s.
     """
     known = np.flatnonzero(np.isfinite(t))
     stamps = t[known]
     lowest_before = np.minimum(stamps[:-3], stamps[1:-2])
     highest_after = np.maximum(stamps[2:-1], stamps[3:])
-    resets = np.flatnonzero(lowest_before - highest_after > MAX_DISORDER) + 2
+    resets = np.flatnonzero(lowest_before - highest_after > 2.0) + 2
     if len(resets):
         before, after = stamps[resets[0] - 1], stamps[resets[0]]
         fall = f"the stamps fall back by {before - after:.3g} s at message {known[resets[0]] + 1}"
@@ -117,9 +113,8 @@ def strays(t: Array) -> BoolArray:
         return np.zeros(len(t), bool)
     before, after = np.append(t[1], t[:-1]), np.append(t[1:], t[-2])
     before[0], after[-1] = t[2], t[-3]
-    far = LIMITS.silence
     apart = np.minimum(np.abs(t - before), np.abs(t - after))
-    return np.asarray((apart > far) & (np.abs(before - after) <= far))
+    return np.asarray((apart > LIMITS.silence) & (np.abs(before - after) <= LIMITS.silence))
 
 
 def windowed(record: Recording, window: Window, file: Path) -> Recording:
@@ -189,8 +184,6 @@ ACCELERATIONS: Final = np.array([20.0, 20.0, 15.0])  # that no vehicle exceeds (
 AROUND: Final = 5  # number of rows before a row, and after it, whose medians it is compared with
 WRAP_SHARE: Final = 0.7  # share of half a turn in a row that marks a yaw that was differenced where it wraps
 MOST_WRONG: Final = 0.05  # largest share of rows that are mistakes of single rows
-FROZEN: Final = 1.2  # longest time (s) for which a repeated pose is one that was not measured anew
-PERIOD: Final = 0.05  # longest part (s) of an interval that is interpolated
 
 
 def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
@@ -220,13 +213,13 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
     if record.are_poses:
         if len(rows) < 2:
             raise InputError(file, f"expected two poses at least, found {len(rows)}")
-        rows = keep(
-            measured_anew(rows[:, 1], rows[:, 2:]),
-            "odometry samples repeat the pose before them, and were left out",
-        )
+        told = "odometry samples repeat the pose before them, and were left out"
+        rows = keep(measured_anew(rows[:, 1], rows[:, 2:]), told)
         notes["odometry samples are differences of poses, whose noise is not white"] += len(rows) - 1
-        moved = twists_between(rows[:, 1], rows[:, 2:])
-        rows = np.column_stack([rows[:-1, :2], moved])
+        # the constant twists that lead from each pose to the next
+        moves = [gtsam.Pose2(*relative(one, other)) for one, other in pairwise(rows[:, 2:])]
+        moved = np.array([gtsam.Pose2.Logmap(move) for move in moves]).reshape(-1, 3)
+        rows = np.column_stack([rows[:-1, :2], moved / np.diff(rows[:, 1])[:, None]])
     rows = rows[_possible(record, rows, file)]
     odometry = interpolated(rows[:, 1], rows[:, 2:], record.parts)
     if record.parts > 1:
@@ -290,21 +283,14 @@ def _why(notes: Counter[str], what: str = "detections") -> list[str]:
     return [f"{number} {text}" for text, number in notes.items() if number and what in text]
 
 
-def twists_between(t: Array, poses: Array) -> Array:
-    """Constant twists (n - 1, 3) that lead from each pose (n, 3) at t (n,) in s to the next."""
-    moves = [relative(one, other) for one, other in pairwise(poses)]
-    logarithms = np.array([gtsam.Pose2.Logmap(gtsam.Pose2(*move)) for move in moves]).reshape(-1, 3)
-    return logarithms / np.diff(t)[:, None]
-
-
 def measured_anew(t: Array, poses: Array) -> BoolArray:
-    """Which poses (n, 3) at t (n,) in s differ from the one before, or stay for longer than `FROZEN`.
+    """Which poses (n, 3) at t (n,) in s differ from the one before, or stay for longer than 1.2 s.
 
     A slow receiver's pose is often repeated at the rate of a faster sensor: differences would be 0, 0, 5 v.
     """
     new = np.append(True, (np.diff(poses, axis=0) != 0.0).any(axis=1))
     since = t - t[np.maximum.accumulate(np.where(new, np.arange(len(t)), 0))]
-    return np.asarray(new | (since > FROZEN))
+    return np.asarray(new | (since > 1.2))
 
 
 def with_yaw_rate(t: Array, twists: Array, imu_t: Array, rates: Array) -> tuple[Array, Array]:
@@ -359,14 +345,14 @@ def jumps(t: Array, twists: Array) -> Array:
 
 
 def parts_of(t: Array) -> int:
-    """Number of parts of an interval of sampled twists at t (n,) in s, each `PERIOD` long at most.
+    """Number of parts of an interval of sampled twists at t (n,) in s, each 0.05 s long at most.
 
     It is 1 for periods up to 0.12 s, which can be held, for those of another unit than s, and for too few
     samples to know their period.
     """
     steps = np.diff(np.unique(t[np.isfinite(t)]))
     period = float(np.median(steps)) if len(steps) >= 20 else 0.0
-    return int(np.ceil(period / PERIOD - 1e-6)) if 0.12 < period < 5.0 else 1
+    return int(np.ceil(period / 0.05 - 1e-6)) if 0.12 < period < 5.0 else 1
 
 
 def interpolated(t: Array, twists: Array, parts: int) -> Odometry:
@@ -425,7 +411,8 @@ def _cycles(
         if any(map(points.equals, scans)):
             notes["messages with detections were repetitions, and were left out"] += 1
             continue
-        notes[SHARED] += bool(scans)
+        told = "messages with detections are at most 1 ms after another one, and are one cycle with it"
+        notes[told] += bool(scans)
         scans.append(points)
     if not found and notes[OUTSIDE]:
         span = f"{begin:.9g} s to {end - logs.MAX_HOLD:.9g} s"
@@ -511,7 +498,11 @@ def in_vehicle_frame(
     not positive definite, it is made from range and bearing at the sensor.
     """
     covariances = found.covariances * np.outer(frames.sides, frames.sides)
-    known = positive_definite(covariances) & (not noise.replace_covariances)
+    xx, xy, yx, yy = covariances.reshape(-1, 4).T
+    with np.errstate(over="ignore", invalid="ignore"):
+        known = np.isfinite(covariances).all(axis=(1, 2)) & logs.is_positive_definite(xx, xy, yy)
+        known &= np.abs(xy - yx) <= 1e-3 * np.maximum(xx, yy)  # messages in single precision
+        known &= (np.maximum(xx, yy) < MAX_RANGE**2) & (not noise.replace_covariances)
     notes[ASSUMED] += int((~known).sum())
     assumed = logs.ray_covariances(found.points * frames.sides, noise.sigmas)
     covariances = np.where(known[:, None, None], covariances, assumed)
@@ -519,16 +510,6 @@ def in_vehicle_frame(
     turned = turn @ covariances @ turn.T
     symmetric = 0.5 * (turned + turned.transpose(0, 2, 1))
     return Detections(t, from_sensor(found.points, frames), symmetric, found.labels)
-
-
-def positive_definite(covariances: Array) -> BoolArray:
-    """Which covariances (m, 2, 2) are finite, symmetric and positive definite, as the format asks."""
-    xx, xy, yx, yy = covariances.reshape(-1, 4).T
-    with np.errstate(over="ignore", invalid="ignore"):
-        good = np.isfinite(covariances).all(axis=(1, 2)) & logs.is_positive_definite(xx, xy, yy)
-        good &= np.abs(xy - yx) <= 1e-3 * np.maximum(xx, yy)  # messages in single precision
-        good &= np.maximum(xx, yy) < MAX_RANGE**2
-    return np.asarray(good)
 
 
 # --- points of lines, kerbs or walls: evenly spaced, and labelled by their side of the driven path ----------
@@ -577,7 +558,8 @@ def nearest_lines(lines: IntArray, lateral: Array) -> BoolArray:
     """Which points (m,) are of the polylines nearest to the path on their side, or of none."""
     kept = np.ones(len(lines), bool)
     numbers = np.unique(lines[lines >= 0])
-    middles = np.array([np.nanmedian(lateral[lines == line]) for line in numbers])
+    beside = (lateral[(lines == line) & ~np.isnan(lateral)] for line in numbers)  # empty beyond the path
+    middles = np.array([np.median(own) if len(own) else np.nan for own in beside])
     for side in (1.0, -1.0):
         away = np.where(side * middles > 0.0, side * middles, np.inf)
         far = numbers[(away > 1.5 * away.min(initial=np.inf)) & np.isfinite(away)]

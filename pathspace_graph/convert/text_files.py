@@ -21,14 +21,12 @@ from .messages import ALONE, BROKEN, Points, cone_points, scan_points, yaw_of
 from .recording import Recording, chosen_motion
 from .settings import LabelRule, Topics
 
-ODOMETRY: Final = "odometry"
-DETECTIONS: Final = "detections"
 QUANTITIES: Final = {  # columns of each file and their quantities; a covariance is of the square of one
-    ODOMETRY: {
+    "odometry": {
         **{"t": "time", "vx": "speed", "vy": "speed", "wz": "yaw_rate"},
         **{"x": "length", "y": "length", "yaw": "angle", "qx": "", "qy": "", "qz": "", "qw": ""},
     },
-    DETECTIONS: {
+    "detections": {
         **{"t": "time", "x": "length", "y": "length", "range": "length", "bearing": "angle", "label": ""},
         **{"xx": "length", "xy": "length", "yy": "length", "line": ""},
     },
@@ -62,13 +60,13 @@ def read_csv(
     if len(words) == len(TUM) and all(map(is_number, words)):
         (t, motion), are_poses, rows = read_trajectory(odometry), True, read_tum(odometry).rows
     else:
-        file = _Columns(ODOMETRY, odometry, columns, used)
+        file = _Columns("odometry", odometry, columns, used)
         (motion, are_poses), t, rows = (
             _motion(file, from_poses=topics.from_poses),
             file.stamps(),
             file.table.rows,
         )
-    scans = _scans(_Columns(DETECTIONS, detections, columns, used), rule)
+    scans = _scans(_Columns("detections", detections, columns, used), rule)
     in_words = ", ".join(f"{quantity} in {unit}" for quantity, unit in sorted(used.items()))
     return Recording(
         t,

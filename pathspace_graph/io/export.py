@@ -142,9 +142,6 @@ def write_geojson(file: Path, track: Map, step: float, plane: LocalPlane) -> Non
 
 # --- Lanelet2 --------------------------------------------------------------------------------------------
 
-_PIECES: Final = 4  # lanelets of a loop; Lanelet2 knows neither length nor successor of a single one
-_FEWEST_WAY_INTERVALS: Final = 2
-
 
 class _Osm:
     """OSM XML that grows by nodes, ways and relations; each gets a number, and a version for readers."""
@@ -179,7 +176,8 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
     osm = _Osm(plane)
     left, right = (boundary.spline for boundary in track.curves("lanelet2"))
     line = find_line(left, right)
-    cuts = np.linspace(*line.ribbon.domain, _PIECES + 1)[: _PIECES if left.periodic else 0]
+    # a loop is four lanelets: Lanelet2 knows neither length nor successor of a single one
+    cuts = np.linspace(*line.ribbon.domain, 5)[: 4 if left.periodic else 0]
     sides = []
     for spline, crossing in zip((left, right), line.crossings(cuts), strict=True):
         pieces = [osm.add_nodes(piece, {}) for piece in _pieces(spline, crossing.u, step)]
@@ -208,13 +206,13 @@ def write_lanelet2(file: Path, track: Map, step: float, plane: LocalPlane) -> No
 def _pieces(spline: BSpline, cuts: Array, step: float) -> list[Array]:
     """Points (n, 2) of each stretch between cuts, without its last one, or of an open curve."""
     if not len(cuts):
-        return [spaced(spline, step, _FEWEST_WAY_INTERVALS)]
+        return [spaced(spline, step, 2)]
     length, (low, high) = spline.length(), spline.domain
     begins = spline.arc_length(low + np.mod(cuts - low, high - low))
     begins = begins[0] + np.mod(begins - begins[0], length)
     pieces = []
     for begin, end in pairwise([*begins, begins[0] + length]):
-        intervals = max(round((end - begin) / step), _FEWEST_WAY_INTERVALS)
+        intervals = max(round((end - begin) / step), 2)
         at = np.linspace(begin, end, intervals + 1)[:-1]
         pieces.append(spline.evaluate(spline.parameters_at(np.mod(at, length))))
     return pieces

@@ -183,43 +183,6 @@ def write_log(log: Log, folder: Path | str, *, check: bool = False, force: bool 
     cannot be read is an InputError instead.
     """
     check_type("log", log, Log)
-    with atomic_folder(folder, logs.LOG_FILE, force=force) as target:
-        (target / logs.LOG_FILE).write_text(_to_toml(log), encoding="utf-8", newline="\n")
-        for name, values in _columns(log).items():
-            write_table(target / name, logs.COLUMNS[name], *values)
-        if check:
-            read_log(target)
-
-
-def _to_toml(log: Log) -> str:
-    """Text of the header."""
-    truth = dict[str, Any]()
-    for name, entries in TRUE_ERRORS.items():
-        values = getattr(log.truth, name, None)
-        truth |= {} if values is None else dict(zip(entries, values, strict=True))
-    sections: dict[str, dict[str, Any]] = {
-        "odometry": {"sigma": log.odometry_sigma, "drift_sigmas": log.odometry_drift},
-        "sensor": vars(log.sensor),
-        **noise_sections(log.odometry_stated, log.detections_stated, log.measured),
-        "source": {_toml(key): value for key, value in log.source.items()},
-        **({"truth": truth} if truth else {}),
-    }
-    lines = [f'format = "{FORMAT}"', *([] if log.scale == 1.0 else [f"scale = {_toml(log.scale)}"])]
-    for name, section in sections.items():
-        known = {key: value for key, value in section.items() if value is not None}
-        lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in known.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    """A text, a number or an array of numbers as TOML."""
-    if not isinstance(value, str):
-        return repr(np.asarray(value).tolist())
-    # a JSON string is a TOML string, but for the delete character
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _columns(log: Log) -> dict[str, tuple[Any, ...]]:
     cycles, truth = log.cycles, log.truth
     covariances = np.concatenate([np.zeros((0, 2, 2)), *(cycle.covariances for cycle in cycles)])
     columns: dict[str, tuple[Any, ...]] = {
@@ -236,24 +199,51 @@ def _columns(log: Log) -> dict[str, tuple[Any, ...]]:
         columns[logs.TRUTH_CONES_FILE] = truth.cones, [NAMES[label] for label in truth.cone_labels]
         if truth.associations is not None:
             columns[logs.TRUTH_ASSOCIATIONS_FILE] = (truth.associations,)
-    return columns
+    with atomic_folder(folder, logs.LOG_FILE, force=force) as target:
+        (target / logs.LOG_FILE).write_text(_to_toml(log), encoding="utf-8", newline="\n")
+        for name, values in columns.items():
+            write_table(target / name, logs.COLUMNS[name], *values)
+        if check:
+            read_log(target)
 
 
-def noise_sections(odometry: bool, detections: bool, measured: MeasuredNoise | None) -> dict[str, Any]:
-    """Sections of the noise, where not all of it is stated."""
-    if odometry and detections and measured is None:
-        return {}
-    has_rays = measured is not None and measured.along is not None
-    section = {
-        "odometry": STATED if odometry else UNSTATED[measured is None],
-        "detections": STATED if detections else UNSTATED[not has_rays],
+def _to_toml(log: Log) -> str:
+    """Text of the header; it has sections of the noise where not all of it is stated."""
+    truth, measured, noise = dict[str, Any](), log.measured, dict[str, dict[str, Any]]()
+    for name, entries in TRUE_ERRORS.items():
+        values = getattr(log.truth, name, None)
+        truth |= {} if values is None else dict(zip(entries, values, strict=True))
+    if not (log.odometry_stated and log.detections_stated and measured is None):
+        has_rays = measured is not None and measured.along is not None
+        noise["noise"] = {
+            "odometry": STATED if log.odometry_stated else UNSTATED[measured is None],
+            "detections": STATED if log.detections_stated else UNSTATED[not has_rays],
+        }
+    if measured is not None:
+        errors = np.column_stack([measured.sensor, measured.sensor_sigma])
+        values = vars(measured) | dict(zip(SENSOR, errors, strict=True))
+        for name in ("along", "across") if has_rays else ():
+            values[name] = [*values[name].sigma, values[name].share, values[name].time]
+        fields = (_MeasuredRays if has_rays else _Measured).__struct_fields__
+        own = (name for name in fields if name != "range_bend" or measured.range_bend)
+        noise["noise.measured"] = {name: values[name] for name in own}
+    sections: dict[str, dict[str, Any]] = {
+        "odometry": {"sigma": log.odometry_sigma, "drift_sigmas": log.odometry_drift},
+        "sensor": vars(log.sensor),
+        **noise,
+        "source": {_toml(key): value for key, value in log.source.items()},
+        **({"truth": truth} if truth else {}),
     }
-    if measured is None:
-        return {"noise": section}
-    errors = np.column_stack([measured.sensor, measured.sensor_sigma])
-    values = vars(measured) | dict(zip(SENSOR, errors, strict=True))
-    for name in ("along", "across") if has_rays else ():
-        values[name] = [*values[name].sigma, values[name].share, values[name].time]
-    entries = (_MeasuredRays if has_rays else _Measured).__struct_fields__
-    names = [name for name in entries if name != "range_bend" or measured.range_bend]
-    return {"noise": section, "noise.measured": {name: values[name] for name in names}}
+    lines = [f'format = "{FORMAT}"', *([] if log.scale == 1.0 else [f"scale = {_toml(log.scale)}"])]
+    for name, section in sections.items():
+        known = {key: value for key, value in section.items() if value is not None}
+        lines += ["", f"[{name}]", *(f"{key} = {_toml(value)}" for key, value in known.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    """A text, a number or an array of numbers as TOML."""
+    if not isinstance(value, str):
+        return repr(np.asarray(value).tolist())
+    # a JSON string is a TOML string, but for the delete character
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -21,7 +21,7 @@ from pathspace_graph.spline.centre_line import find_line
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
 from .brief import Brief, Shown, pictures
-from .parsing import MAX_COORDINATE, MAX_DEGREE, read_json, shown, typed
+from .parsing import MAX_COORDINATE, read_json, shown, typed
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -259,7 +259,7 @@ class _Points(Struct):
 class _Curve(Struct):
     """A curve as it stands in a file."""
 
-    degree: Annotated[int, Meta(ge=1, le=MAX_DEGREE)]
+    degree: Annotated[int, Meta(ge=1, le=20)]
     periodic: bool
     knots: list[Coordinate]
     control_points: list[Point]
@@ -287,64 +287,56 @@ def map_from_json(content: Any, file: Path | str = MAP_FILE) -> Map:
     top = typed(content, _File, file)
     boundaries: dict[int, MapBoundary] = {}
     for name, entry in sorted(top.boundaries.items()):
+        kind: type[_Points | _Curve] = _Points if isinstance(entry, dict) and "points" in entry else _Curve
         where = f"boundaries.{name}"
-        if isinstance(entry, dict) and "points" in entry:
-            boundaries[LABELS[name]] = _points(typed(entry, _Points, file, where), file, where)
-        else:
-            boundaries[LABELS[name]] = _curve(typed(entry, _Curve, file, where), file, where)
-    points = {LABELS[name]: _points(cones, file, f"points.{name}") for name, cones in top.points.items()}
-    joint = None if top.cross_covariance is None else _joint(top.cross_covariance, boundaries, file)
+        boundaries[LABELS[name]] = _boundary(typed(entry, kind, file, where), file, where)
+    points: Any = {LABELS[name]: _boundary(own, file, f"points.{name}") for name, own in top.points.items()}
+    if top.cross_covariance is None:
+        return Map(top.closed, boundaries, None, points)
+    where = "cross_covariance"
+    if len(boundaries) != len(BOUNDARIES):
+        raise InputError(file, f"{where}: expected both boundaries, found {len(boundaries)}")
+    left, right = (boundaries[label].covariance for label in BOUNDARIES)
+    block = _matrix(top.cross_covariance, (len(left), len(right)), file, where)
+    joint = np.block([[left, block], [block.T, right]])
+    if not _is_covariance(joint):
+        raise InputError(file, f"{where}: expected a joint covariance that is positive semidefinite")
     return Map(top.closed, boundaries, joint, points)
 
 
-def _points(read: _Points, file: Path, where: str) -> PointBoundary:
-    return PointBoundary(_rows(read.points), _covariance(read, len(read.points), file, where))
-
-
-def _curve(read: _Curve, file: Path, where: str) -> SplineBoundary:
-    try:
-        spline = BSpline(np.array(read.knots), _rows(read.control_points), read.degree, read.periodic)
-    except SettingsError as error:
-        raise InputError(file, f"{where}: {error}") from None
-    (low, high), until, cones = spline.domain, read.confirmed_until, _rows(read.cones)
-    if until < low or high < until < math.inf:
-        expected = f"expected a number from {low:g} to {high:g}, found {until:g}"
-        raise InputError(file, f"{where}.confirmed_until: {expected}")
-    if not ((cones >= [low, 0.0]) & (cones[:, :1] <= high)).all():
-        expected = f"expected parameters from {low:g} to {high:g} and sigmas from 0 on"
-        raise InputError(file, f"{where}.cones: {expected}")
-    return SplineBoundary(spline, _covariance(read, spline.size, file, where), min(until, high), cones)
-
-
-def _rows(points: list[Point]) -> Array:
-    return np.array(points, float).reshape(-1, 2)
-
-
-def _covariance(read: _Points | _Curve, size: int, file: Path, where: str) -> Array:
+def _boundary(read: _Points | _Curve, file: Path, where: str) -> MapBoundary:
+    """Check what a file says of a boundary, and take it."""
+    if isinstance(read, _Points):
+        places = np.array(read.points, float).reshape(-1, 2)
+        size = len(places)
+    else:
+        places = np.array(read.control_points, float).reshape(-1, 2)
+        try:
+            spline = BSpline(np.array(read.knots), places, read.degree, read.periodic)
+        except SettingsError as error:
+            raise InputError(file, f"{where}: {error}") from None
+        (low, high), until, size = spline.domain, read.confirmed_until, spline.size
+        if until < low or high < until < math.inf:
+            expected = f"expected a number from {low:g} to {high:g}, found {until:g}"
+            raise InputError(file, f"{where}.confirmed_until: {expected}")
+        cones = np.array(read.cones, float).reshape(-1, 2)
+        if not ((cones >= [low, 0.0]) & (cones[:, :1] <= high)).all():
+            expected = f"expected parameters from {low:g} to {high:g} and sigmas from 0 on"
+            raise InputError(file, f"{where}.cones: {expected}")
     if read.size != size:
         raise InputError(file, f"{where}.size: expected {size} (what is listed), found {read.size}")
     covariance = _matrix(read.covariance, (2 * size, 2 * size), file, f"{where}.covariance")
     if not _is_covariance(covariance):
         raise InputError(file, f"{where}.covariance: expected a symmetric, positive semidefinite matrix")
-    return covariance
+    if isinstance(read, _Points):
+        return PointBoundary(places, covariance)
+    return SplineBoundary(spline, covariance, min(until, high), cones)
 
 
 def _matrix(rows: Matrix, shape: tuple[int, int], file: Path, where: str) -> Array:
     if len(rows) != shape[0] or any(len(row) != shape[1] for row in rows):
         raise InputError(file, f"{where}: expected {shape[0]} rows of {shape[1]} finite numbers")
     return np.array(rows, float).reshape(shape)
-
-
-def _joint(cross: Matrix, boundaries: Mapping[int, MapBoundary], file: Path) -> Array:
-    where = "cross_covariance"
-    if len(boundaries) != len(BOUNDARIES):
-        raise InputError(file, f"{where}: expected both boundaries, found {len(boundaries)}")
-    left, right = (boundaries[label].covariance for label in BOUNDARIES)
-    block = _matrix(cross, (len(left), len(right)), file, where)
-    joint = np.block([[left, block], [block.T, right]])
-    if not _is_covariance(joint):
-        raise InputError(file, f"{where}: expected a joint covariance that is positive semidefinite")
-    return joint
 
 
 def _is_covariance(P: Array) -> bool:

@@ -22,9 +22,7 @@ T = TypeVar("T")
 
 MAX_FILE_BYTES: Final = 2**30
 MAX_HEADER_BYTES: Final = 2**22  # also of a study
-MAX_TRACK_BYTES: Final = 2**23
 MAX_DEPTH: Final = 32  # of lists and tables in each other
-MAX_VARIANTS: Final = 10_000  # of a study's grid
 
 MAX_STAMP: Final = 1e10  # s: 300 years; stamps in milliseconds or nanoseconds are beyond it
 MAX_HELD: Final = 1e3  # m, moved by a twist until the next row
@@ -32,12 +30,7 @@ MAX_DRIVE: Final = 1e6  # m
 MAX_RANGE: Final = 1e4  # m, each coordinate of a detection
 MAX_DETECTIONS: Final = 10_000  # of one perception cycle
 MAX_COORDINATE: Final = 1e8  # m, of a map, a trajectory or a track; any geodetic grid has room in it
-MAX_DEGREE: Final = 20
 MAX_NOISE: Final = 1e6  # a number in a log's header, in its own unit
-MAX_TRACK_LENGTH: Final = 3e4  # m; rows are matched in a time that grows with its square
-MAX_TRACK_WIDTH: Final = 100.0  # m, from the middle of a track to a boundary
-MAX_CONES: Final = 6_000  # of each boundary of a track
-SHOWN_CHARACTERS: Final = 120  # of what was found, in a message
 
 TOO_DEEP: Final = f"expected lists and tables nested at most {MAX_DEPTH} deep, found deeper ones"
 _SHORT: Final = Repr()
@@ -47,7 +40,7 @@ _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 80, 60, 
 def shown(value: Any) -> str:
     """Short text of any value, for a message."""
     text = _SHORT.repr(value)
-    return text if len(text) <= SHOWN_CHARACTERS else text[: SHOWN_CHARACTERS - 3] + "..."
+    return text if len(text) <= 120 else text[:117] + "..."
 
 
 def read_text(file: Path, expected: str = "a file", most: int = MAX_FILE_BYTES) -> str:

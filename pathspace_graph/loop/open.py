@@ -34,6 +34,7 @@ from .worker import Unsolved
 STAYS_OPEN: Final = "the loop stays open"  # beginning of the notice without a batch that agrees
 REVISITED: Final = "the road was driven before: the open map was optimized with the earlier pass"
 """Notice of the first cycle with a revisit."""
+RETRY: Final = 20.0  # least path from one batch of the lap to the next, where it does not agree (m)
 MOST_CONES: Final = 4000  # most cones of a lap that is solved as a batch: with more it would not be in time
 MOST_LAID_ON: Final = (
     300  # most control points of an open map that a batch replaces: a cycle takes their cube
@@ -83,7 +84,7 @@ class Open(Phase):
                 revisit = self.returns.find(road, record, noise)
             self._closes = revisit is not None
             if self._closes:
-                self.returns.rest(road, self.settings.open_lap.retry)
+                self.returns.rest(road, RETRY)
             else:
                 revisit = self.revisits.find(road, record, noise)
             if revisit is None:

@@ -15,10 +15,12 @@ from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import SIDES, Candidates, End, PathAhead, chain, crosses
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
-from pathspace_graph.mapping.tracks import Tracks, nearest_within
+from pathspace_graph.mapping.tracks import FORGET_AFTER, KNOWN_SIGMA, Tracks, nearest_within
 from pathspace_graph.settings.online import GrowthSettings
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
+GROWTH_REACH: Final = 7.0  # farthest ahead of the vehicle that a boundary is extended (m along the path)
+MAX_SIZE: Final = 5000  # number of control points from which on an open curve grows no further
 NEWEST: Final = 3  # number of newest cones that determine, with its end, a curve's distance from the path
 RECALL: Final = 25.0  # newest stretch of path and curves that counts (m): in a second round, not the first
 NEARER: Final = 0.5  # least decrease of the distance at which the path passes a cone again (m)
@@ -31,7 +33,7 @@ class Growth(Copyable):
 
     def __init__(self, settings: GrowthSettings) -> None:
         self.settings = settings
-        self.tentative = Tracks(settings.merge_radius, settings.forget_after)  # unexplained cones
+        self.tentative = Tracks(settings.merge_radius, FORGET_AFTER)  # unexplained cones
         self._known: Mapping[int, float] = {}  # ends of curves that were known before the drive (m)
         self.taken_back = 0  # how often a curve was shortened
         self._full: frozenset[int] = frozenset()  # boundaries that have stopped growing
@@ -50,7 +52,7 @@ class Growth(Copyable):
         """Begin or extend each boundary; return the labels of the curves that were extended, and a notice."""
         full, grown, track = self._full, set(), smoother.map
         for label in BOUNDARIES:
-            begins = self._known.get(label, -np.inf) - self.settings.reach
+            begins = self._known.get(label, -np.inf) - GROWTH_REACH
             if label not in track.state.boundaries:
                 self._begin(track, label, path_ahead)
             elif track.state.pose_u[label][-1] < begins or self._is_full(track, label, path_ahead):
@@ -170,7 +172,7 @@ class Growth(Copyable):
         found = found.where(chain(found, end))
         # In a hairpin, the row of the way back may be known before the next cone of the way there: candidates
         # up to the first uncertain one ahead count. Uncertain ones that were passed are skipped.
-        known = tracks.sigmas(found.indices) < settings.sigma
+        known = tracks.sigmas(found.indices) < KNOWN_SIGMA
         waiting = np.flatnonzero(~known & (found.stations > path_ahead.driven))
         found = found.where(np.flatnonzero(known[: waiting[0]] if len(waiting) else known))
         return found if end is None else found.where(_uncrossed(track.state, label, path_ahead, end, found))
@@ -178,7 +180,7 @@ class Growth(Copyable):
     def _is_full(self, track: CurveMap, label: int, path_ahead: PathAhead) -> bool:
         boundary = track.state.boundaries[label]
         longest = self._known.get(label, 0.0) + LENGTH_FREE + LENGTH_DRIVEN * path_ahead.driven
-        is_full = boundary.size >= self.settings.max_size or boundary.confirmed_end >= longest
+        is_full = boundary.size >= MAX_SIZE or boundary.confirmed_end >= longest
         if is_full:
             self._full |= {label}
         return is_full

@@ -13,9 +13,9 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometr
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, pose_key
 from pathspace_graph.graph.window import MapRows, SmootherSettings
-from pathspace_graph.io.log import Odometry
+from pathspace_graph.io.log import SIGMA_ODOMETRY, Odometry
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import OdometrySettings
 
 from .path import DrivenPath
@@ -78,7 +78,7 @@ def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:
     three positive numbers.
     """
     if sigma is None:
-        return KnownNoise(np.array(ODOMETRY_SIGMA), odometry_stated=False)
+        return KnownNoise(np.array(SIGMA_ODOMETRY), odometry_stated=False)
     if not isinstance(sigma, KnownNoise):
         sigma = KnownNoise(sigma)
     try:

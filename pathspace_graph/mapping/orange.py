@@ -19,7 +19,7 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.labels import POINTS
 from pathspace_graph.mapping.detections import DetectionColumns
-from pathspace_graph.mapping.tracks import linked
+from pathspace_graph.mapping.tracks import KNOWN_SIGMA, linked
 from pathspace_graph.settings.online import GrowthSettings
 
 VAGUE: Final = 0.6  # standard deviation of a detection from which on it tells no number of cones (m)
@@ -65,7 +65,7 @@ def orange_cones(
 ) -> dict[int, PointBoundary]:
     """Merge detections to cones, by label, given the calibration (5,) or (0,) of the sensor.
 
-    A cone has at least `settings.sightings` detections, and is known to `settings.sigma` (m). The standard
+    A cone has at least `settings.sightings` detections, and is known to `KNOWN_SIGMA` (m). The standard
     deviation `sigma` (m) is added to each.
     """
     cycle, points = seen.cycle, to_map(seen.corrected(slice(None), sensor), seen.pose)
@@ -77,7 +77,7 @@ def orange_cones(
         for place in linked(points[rows], settings.merge_radius):
             at = rows[place]
             for mean, known, count in _cones(cycle[at], points[at], covariances[at]):
-                if count >= settings.sightings and np.linalg.eigvalsh(known)[-1] < settings.sigma**2:
+                if count >= settings.sightings and np.linalg.eigvalsh(known)[-1] < KNOWN_SIGMA**2:
                     means.append(mean)
                     blocks.append(known + sigma**2 * np.eye(2))
         if means:

@@ -17,7 +17,7 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
-from .growth import Growth
+from .growth import GROWTH_REACH, Growth
 from .motion import MeasuredMotion, predict
 from .orange import OrangeDetections, orange_cones
 from .path import DrivenPath
@@ -96,7 +96,7 @@ class Road:
         """Grow open curves, and deactivate the part of the map behind; return a notice."""
         self.grown, notice = frozenset(), ""
         if not self.closed:
-            path_ahead = self.path.ahead(self.poses[-1], self.settings.growth.reach)
+            path_ahead = self.path.ahead(self.poses[-1], GROWTH_REACH)
             self.grown, notice = self.growth.expand(self.smoother, path_ahead)
             if self.grown:
                 self.smoother.map.lay_out_stations()  # control points are on other rows

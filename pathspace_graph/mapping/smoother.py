@@ -19,6 +19,8 @@ from .curve_map import CurveMap
 from .detection_rows import rows_across
 from .motion import smoother_settings
 
+CHI_UNKNOWN: Final = 1.5  # gate of unknown colour, own sigmas: a start line would bend curves
+STATION_STEP: Final = 1.5  # way in a cycle beyond which the pose's foot point is searched for (m)
 FAR_STRETCH: Final = 12.0  # least length behind the vehicle of which an open curve becomes inactive (m)
 FAR_ROOM: Final = 40.0  # length beyond what the vehicle sees that stays active (m)
 
@@ -94,7 +96,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         """Use detections (m,) that pass the gate of their curve (m,); return innovations (m,) in sigmas."""
         detections, state, gate = self.map.detections, self.map.state, self.map.settings.gate
         sigma_model = self.map.settings.spline.sigma_model
-        limits = (sigma_model, gate.sigma_floor, gate.rough, gate.chi, gate.chi_unknown, UNKNOWN)
+        limits = (sigma_model, gate.sigma_floor, gate.rough, gate.chi, CHI_UNKNOWN, UNKNOWN)
         columns = detections.cycle, detections.label, detections.covariance
         poses, at = (self.variables.poses, self.first_cycle), (foot.normal_unit, foot.distance, foot.interior)
         variance, accepted, doubtful = kernels.gated(rows, *columns, *poses, at, limits)
@@ -133,7 +135,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         """Find foot points of detections at points (m, 2) on their curves (m,); locate the newest pose."""
         state, gate, s = self.map.state, self.map.settings.gate, self.map.settings.spline
         curves, room = state.curves, (gate.station_behind, gate.station_ahead)
-        if float(np.hypot(*(state.poses[-1, :2] - state.poses[-2, :2]))) < gate.station_step:
+        if float(np.hypot(*(state.poses[-1, :2] - state.poses[-2, :2]))) < STATION_STEP:
             room = s.refine_room, s.refine_room
         foot, beside = kernels.in_view(
             curves.searched,

@@ -18,6 +18,8 @@ MERGE_SIGMAS: Final = 2.5  # gate of a smeared detection about a track, in sigma
 MERGE_MOST: Final = 2.0  # largest such gate, in merge radii: the next cone of the row is farther away
 RESTORED: Final = 0.3  # standard deviation of a cone that is taken back from a curve (m)
 MAX_TRACKS: Final = 2000  # largest number of tracks; the oldest ones are dropped
+KNOWN_SIGMA: Final = 0.4  # largest standard deviation, in any direction, of a track that is in the map (m)
+FORGET_AFTER: Final = 6.0  # time without a detection after which a tentative track is dropped (s)
 RECKONED: Final = 3.0  # time without a detection over which dead reckoning keeps the place of a cone (s)
 
 

@@ -9,10 +9,9 @@ from typing import Annotated, Any, Final, Literal
 from cyclopts import Group, Parameter
 
 from pathspace_graph.settings.checked import Checked
-from pathspace_graph.settings.estimators import BATCH_NAMES, ONLINE_NAMES
 from pathspace_graph.settings.evaluation import ScalingSettings
-from pathspace_graph.settings.mapper import MapperSettings, Start
-from pathspace_graph.settings.output import RecordingSettings, SpeedSettings
+from pathspace_graph.settings.mapper import BATCH_NAMES, ONLINE_NAMES, MapperSettings, Start
+from pathspace_graph.settings.output import SpeedSettings
 
 INLINE: Final = Parameter(name="*")
 """Settings whose options have no prefix."""
@@ -124,7 +123,6 @@ class Online(Checked, Estimation, FolderCommand, group=""):
     """Show the run in the live viewer rerun."""
     save_view: Annotated[Path | None, FILE] = None
     """File (.rrd) for what the viewer shows."""
-    recording: RecordingSettings = field(default_factory=RecordingSettings)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,12 +3,10 @@
 The texts of the hints are a table, `hints.csv`.
 """
 
-import csv
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from importlib.resources import files
 from itertools import chain
 from math import hypot
 from pathlib import Path
@@ -38,9 +36,6 @@ from pathspace_graph.settings.online import LimitSettings
 
 from .regression import Better, Complex, Fit, Regression, dead_reckoned, far_better, motions_of
 
-SURVIVABLE: Final = {"gaps", "reach", "mounting", "covariances", "labels", "noise", "sides"}
-"""Causes in spite of which a map can be right."""
-
 
 @dataclass(frozen=True)
 class Hint:
@@ -63,13 +58,13 @@ class Hint:
         return f"{self.file}, {self.columns}: {self.found}; likely cause: {self.likely}; {self.advice}"
 
 
-with (files(__package__) / "hints.csv").open(encoding="utf-8") as _file:
-    TEXTS: Final = {row.pop("mistake"): row for row in csv.DictReader(_file)}
-    """Fields of the hint of each mistake, with places for its figures."""
+TEXTS: Final = read_table(Path(__file__).with_name("hints.csv")).columns
+"""Fields of the hint of each mistake, with places for its figures."""
 
 
 def hint_of(mistake: str, **figures: Any) -> Hint:
-    return Hint(**{name: text.format(**figures) for name, text in TEXTS[mistake].items()})
+    row = TEXTS["mistake"].tolist().index(mistake)
+    return Hint(**{entry.name: TEXTS[entry.name][row].format(**figures) for entry in fields(Hint)})
 
 
 def because(hints: Sequence[Hint]) -> str:
@@ -79,8 +74,9 @@ def because(hints: Sequence[Hint]) -> str:
 
 
 def objections(hints: Sequence[Hint]) -> list[str]:
-    """Why the map of a log with these hints is wrong; empty if all are `SURVIVABLE`."""
-    likely = [hint.likely for hint in hints if hint.cause not in SURVIVABLE]
+    """Why the map of a log with these hints is wrong; empty if it can be right in spite of all of them."""
+    survivable = ("gaps", "reach", "mounting", "covariances", "labels", "noise", "sides")
+    likely = [hint.likely for hint in hints if hint.cause not in survivable]
     return [f"not a map of the drive: {'; '.join(likely)}"] if likely else []
 
 
@@ -224,7 +220,7 @@ def possible_rows(log: Log) -> tuple[Log, list[Hint]]:
 def beyond_any_vehicle(log: Log) -> list[Hint]:
     vx, vy, wz = log.odometry.twist.T
     speed, rate = (np.quantile(one, 0.9) for one in (np.hypot(vx, vy), np.abs(wz)))
-    # that no vehicle exceeds in a tenth of its time (m/s, rad/s)
+    # m/s and rad/s that no vehicle exceeds in a tenth of its time
     found = [hint_of("too fast", speed=speed)] if speed > 100.0 else []
     return found + ([hint_of("turns too fast", rate=rate)] if rate > 8.0 else [])
 
@@ -479,13 +475,7 @@ def _detection_hints(log: Log) -> list[Hint]:
             is_unit = not 0.1 < ratio < 10.0
             how = f"too {'small' if small > large else 'large'}"
             how += ", as in another unit, or there are none at all" if is_unit else ""
-            figures = {
-                "scatter": scatter,
-                "at": at,
-                "stated": scatter * ratio,
-                "way": way,
-                "how": how,
-            }
+            figures = {"scatter": scatter, "at": at, "stated": scatter * ratio, "way": way, "how": how}
             cause = "covariances" if is_unit else "noise"
             found[max(small, large)] = hint_of("noise of detections", cause=cause, **figures)
     return [found[max(found)]] if found else []
@@ -561,17 +551,6 @@ def _nearest_of_side(detections: Detections) -> tuple[Array, Array]:
 # --- logs that are refused, and words of labels ----------------------------------------------------------
 
 
-def read_usable_log(folder: Path, limits: LimitSettings, scale: float | None = None) -> Log:
-    """Read a log and check all its cycles; an unusable one raises an InputError with file, row and stamp.
-
-    A `scale` of the scene replaces that of the log.
-    """
-    log = read_log(folder)
-    log = log if scale is None else replace(log, scale=scale)
-    check_usable(log, folder, limits)
-    return log
-
-
 def read_plausible_log(
     folder: Path, limits: LimitSettings, scale: float | None = None
 ) -> tuple[Log, list[Hint]]:
@@ -580,11 +559,14 @@ def read_plausible_log(
     A `scale` of the scene replaces that of the log.
     """
     try:
-        log = read_usable_log(folder, limits, scale)
+        log = read_log(folder)
+        log = log if scale is None else replace(log, scale=scale)
+        check_usable(log, folder, limits)
     except InputError as error:
-        of_data = error.file.name in (ODOMETRY_FILE, DETECTIONS_FILE)
+        if error.file.name not in (ODOMETRY_FILE, DETECTIONS_FILE):
+            raise
         by_size = ("stamps", "clocks", "positions", "speeds", "yaw rate", "odometry", "covariances")
-        found = [hint for hint in refused_hints(folder) if hint.cause in by_size] if of_data else []
+        found = [hint for hint in refused_hints(folder) if hint.cause in by_size]
         if not found:
             raise
         raise InputError(error.file, f"{error.message}; {because(found)}", error.row) from error

@@ -36,10 +36,8 @@ Complex = NDArray[np.complex128]
 
 # --- motion by the cones ---------------------------------------------------------------------------------
 
-MOST_CYCLES: Final = 1000  # approximate number of cycles in use, in bursts of successive ones
 REACHES: Final = (1.5, 1.2, 0.9, 0.7, 0.5, 0.4, 0.4)  # reach of each step of a registration (m)
 LIMITS: Final = (FARTHEST, 0.5, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED, LEAST_SHARE)  # 0.5: least sum of weights
-SIGMA: Final = 0.15  # standard deviation of a coordinate (m), as the stated one may be wrong
 APART: Final = 1.7  # distance of further starts of a registration (m), on rings around no motion
 FURTHER: Final = [
     ring * np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -61,12 +59,11 @@ class Motions:
     tried: int  # number of pairs of cycles that were compared
 
 
-def motions_of(
-    log: Log, most: int = MOST_CYCLES, fewest: int = MIN_DOUBTING, fastest: float = 30.0
-) -> Motions:
+def motions_of(log: Log, most: int = 1000, fewest: int = MIN_DOUBTING, fastest: float = 30.0) -> Motions:
     """Register nearby cycles to each other; the odometry gives only the first of several starts.
 
-    Further starts are tried up to a speed `fastest` (m/s).
+    About `most` cycles are used, in bursts of successive ones. Further starts are tried up to a speed
+    `fastest` (m/s).
     """
     cycles = []  # each with its sixteen nearest detections
     for cycle in log.cycles:
@@ -105,9 +102,10 @@ def register(
 ) -> tuple[float, Array, Array]:
     """Share of matched detections, the motion (3,) and its information (3, 3) by the best start.
 
+    A coordinate has a standard deviation of 0.15 m, as the stated one may be wrong.
     Where these starts match too little, further ones are tried, up to a distance (m).
     """
-    best, variances = (0.0, np.zeros(3), np.zeros((3, 3))), np.full(len(after.labels), SIGMA**2)
+    best, variances = (0.0, np.zeros(3), np.zeros((3, 3))), np.full(len(after.labels), 0.15**2)
     further = (far for far in FURTHER if np.hypot(*far[:2]) < farthest)
     for k, start in enumerate(chain(starts, further)):
         if best[0] > (0.75 if k < len(starts) else MATCHED):
@@ -133,11 +131,9 @@ def mean_twist(motion: Array, dt: float) -> Array:
 Content = Literal["twist", "fixed", "pose"]
 CONTENTS: Final[tuple[Content, ...]] = ("twist", "fixed", "pose")
 LAGS: Final[list[float]] = np.arange(-10.0, 10.01, 0.25).tolist()  # candidate lags (s)
-FLOORS: Final = np.array([0.3, 0.3, 0.05])  # added to the standard deviations of a motion (m/s, m/s, rad/s)
 WIDE: Final = 2.0  # sigmas at which a motion counts as explained by `exp(-1/2)`
 STEPS: Final = 6  # steps of reweighting
 LAG_STEP: Final = 0.05  # half the difference that approximates a derivative by the lag (s)
-AROUND: Final = 9  # number of motions in a median
 
 
 @dataclass(frozen=True)
@@ -196,7 +192,8 @@ class Regression:
         )
         self._sums = {"twist": (way, turn), "fixed": (path, turn), "pose": (v, np.unwrap(w, period=period))}
         sizes = np.abs([motions.velocity, motions.velocity, motions.rate]).T
-        self._variance = variance = motions.covariance + np.square(FLOORS + 0.08 * sizes)[:, None] * np.eye(3)
+        added = np.array([0.3, 0.3, 0.05]) + 0.08 * sizes  # standard deviations (m/s, m/s, rad/s)
+        self._variance = variance = motions.covariance + np.square(added)[:, None] * np.eye(3)
         self._information, self._of_way = np.linalg.inv(variance), np.linalg.inv(variance[:, :2, :2])
 
     def stated(self, content: Content, lag: float) -> tuple[Complex, Array]:
@@ -317,7 +314,7 @@ class Regression:
         """Medians (P,) of successive motions, which explain what the cones show."""
         v = self.motions.velocity
         columns = np.column_stack([v.real, v.imag, self.motions.rate])
-        vx, vy, rate = scipy.ndimage.median_filter(columns, size=(AROUND, 1), mode="nearest").T
+        vx, vy, rate = scipy.ndimage.median_filter(columns, size=(9, 1), mode="nearest").T
         return vx + 1j * vy, rate
 
 

@@ -1,20 +1,21 @@
 """Settings of the evaluation: extent of the timing."""
 
 from dataclasses import dataclass
+from typing import Final
 
 from pathspace_graph.errors import SettingsError
 
 from .checked import Checked
+
+CONES_MIN: Final = 50.0  # number of cones seen at which the sweep over cones begins
 
 
 @dataclass(frozen=True)
 class ScalingSettings(Checked):
     """Extent of the timing."""
 
-    cones_min: float = 50.0
-    """Least number of cones seen of a point of the sweep over cones."""
     cones_max: float = 2000.0
-    """Number of cones seen at which the sweep over cones ends."""
+    """Number of cones seen at which the sweep over cones ends, which begins at 50."""
     bins: int = 16
     """Number of points of the sweep over cones, evenly spaced on a logarithmic axis."""
     fit_from: float = 200.0
@@ -31,13 +32,11 @@ class ScalingSettings(Checked):
     """Cones of the closed road."""
     budget: float = 0.5
     """Mean update at which an estimator is stopped (s)."""
-    seed: int = 1
-    """Seed of the drives and of the choice of detections."""
 
     def __post_init__(self) -> None:
         """Raise SettingsError as well where a range is empty."""
         super().__post_init__()
-        if self.cones_min >= self.cones_max:
-            raise SettingsError(f"cones_min: expected less than cones_max, found {self.cones_min:g}")
+        if self.cones_max <= CONES_MIN:
+            raise SettingsError(f"cones_max: expected more than {CONES_MIN:g}, found {self.cones_max:g}")
         if not self.readings or min(self.readings) < 1:
             raise SettingsError(f"readings: expected numbers of at least 1, found {self.readings}")

@@ -1,9 +1,9 @@
 """Settings of the estimators; a number that nobody changes is a constant, here or beside its use."""
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Final, Literal, Self
 
-from pathspace_graph.errors import SettingsError, check_type
+from pathspace_graph.errors import check_type
 from pathspace_graph.labels import Kind
 
 from .checked import Checked, Unlimited
@@ -16,6 +16,11 @@ from .online import (
     OdometrySettings,
     SidesSettings,
 )
+
+ONLINE_NAMES: Final = ("fixed-lag", "landmark-fixed-lag", "ckf", "landmark-ckf")
+"""Names of our own online estimators, the default one first."""
+BATCH_NAMES: Final = ("spline", "landmark-batch")
+"""Names of our own batch estimators, the default one first."""
 
 Start = Literal["auto", "online", "odometry"]
 
@@ -30,9 +35,6 @@ class SplineSettings(Checked):
     """Distance of neighbouring control points of an open, growing curve, m."""
     size_share: float = 0.43
     """Control points after closing as a share of the distinct cones that were detected (paper: 0.44)."""
-    linear_baseline: float = 0.5
-    """Share of the knots of the paper's filter that is spread evenly along the curve; the others follow its
-    curvature."""
     sigma_model: float = 0.25
     """Standard deviation of a cone's distance from the curve, m, added in each detection. It is larger than
     the offsets, about 0.1 m, since a cone has the same one each time."""
@@ -40,21 +42,10 @@ class SplineSettings(Checked):
     """Standard deviation of what a curve with few control points cannot follow, m, added in a closed map."""
 
     min_size: ClassVar[int] = 8  # least number of control points of a closed boundary
-    sigma_simplify: ClassVar[float] = 0.1  # m, of a control point's move by simplification: a looser prior
-    confirmed_margin: ClassVar[float] = 0.5  # m past its last cone up to which an open curve is believed
     search_step: ClassVar[float] = 1.0  # m along the curve, of the grid of a global search for foot points
     search_iterations: ClassVar[int] = 2  # Newton steps at the end of that search
     refine_room: ClassVar[float] = 2.0  # m along the curve, of a foot point's move in a Gauss-Newton step
     refine_iterations: ClassVar[int] = 1  # Newton steps that refine a foot point in a Gauss-Newton step
-    fit_smoothness: ClassVar[float] = 0.1  # weight of second differences in the fit to tentative tracks
-    fit_held: ClassVar[int] = 4  # points of the known curve's end that this fit passes, to keep its shape
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.linear_baseline > 1.0:
-            raise SettingsError(
-                f"spline.linear_baseline: expected a share of at most 1, found {self.linear_baseline}"
-            )
 
 
 @dataclass(frozen=True)
@@ -89,11 +80,9 @@ class GateSettings(Checked):
 
     view_ahead: ClassVar[float] = 25.0  # m along a curve, of the farthest place ahead that a detection is on
     view_behind: ClassVar[float] = 4.0  # farthest such place behind the vehicle, m
-    chi_unknown: ClassVar[float] = 1.5  # gate of unknown colour, own sigmas: a start line would bend curves
     sigma_floor: ClassVar[float] = 0.1  # m, of errors that the model does not know, added in the gate
     rough: ClassVar[float] = 3.0  # distance from a curve beyond which no detection is associated with it, m
-    station_step: ClassVar[float] = 1.5  # m in a cycle, beyond which the pose's foot point is searched for
-    station_ahead: ClassVar[float] = 8.0  # how far that search goes ahead of the last foot point, m
+    station_ahead: ClassVar[float] = 8.0  # how far a pose's foot point is searched for ahead of the last, m
     station_behind: ClassVar[float] = 3.0  # how far it goes back, m along the curve
     station_lateral: ClassVar[float] = 10.0
     """Distance from a curve at which the vehicle has lost its place, m, as where it leads the other way:
@@ -126,8 +115,6 @@ class OpenLapSettings(Checked, group="open_lap"):
     """Cycles after the return at which the batch closes the loop, or as many as the window holds."""
     ends: tuple[int, ...] = ()
     """Cycles in which the batches replace the prior in a replay: `batches.ends` of `summary.json`."""
-    retry: float = 20.0
-    """Least length of path from one batch of the lap to the next, where it does not agree (m)."""
 
 
 @dataclass(frozen=True)
@@ -153,14 +140,6 @@ class BatchSettings(Checked):
 class CkfSettings(Checked):
     """The paper's filters."""
 
-    ridge: float = 0.05
-    """Lambda of the ridge regression, which ties control points to their places (paper: Update)."""
-    sigma_along: float = 1.0
-    """Standard deviation of a cone's distance along the curve from its foot point (m), added likewise."""
-    threshold: float = 4.0
-    """Growth threshold (m): a detection nearer to the end updates the curve instead of extending it."""
-    separation: float = 4.0
-    """Least distance of an extension from the second-to-last control point (m)."""
     sigma_bend: float = 0.5
     """Standard deviation of the second difference of the control points that an extension moves or adds, as a
     share of their spacing. A large value gives the filter as it is published, whose uncertainty multiplies
@@ -168,9 +147,7 @@ class CkfSettings(Checked):
     sightings: int = 3
     """Detections that make a landmark of the baseline filter; its description has 1: every one."""
 
-    sigma_model: ClassVar[float] = (
-        0.25  # m, of a cone's distance from a smooth curve, added in each detection
-    )
+    sigma_model: ClassVar[float] = 0.25  # m, of a cone's distance from a smooth curve, of each detection
 
 
 @dataclass(frozen=True)
@@ -229,10 +206,6 @@ class MapperSettings(Checked, group=""):
     def sigmas_calibrations(self) -> tuple[float, ...]:
         """Prior standard deviations, (2,) or (7,), of odometry and sensor."""
         return (*self.odometry.sigmas, *self.calibration.sigmas)
-
-
-ODOMETRY_SIGMA = (0.25, 0.12, 0.035)
-"""Standard deviations of a twist (m/s, m/s, rad/s) where none are given; they are the simulator's."""
 
 
 def known_settings(settings: MapperSettings | None) -> MapperSettings:

@@ -12,18 +12,10 @@ from .checked import Checked, Signed, Unlimited
 class GrowthSettings(Checked):
     """How the open end of a curve grows, and what a tentative track is."""
 
-    reach: float = 7.0
-    """Farthest ahead of the vehicle that a boundary is extended (m along the predicted path)."""
     sightings: int = 3
     """Detections within `merge_radius` that confirm a tentative track."""
-    sigma: float = 0.4
-    """Largest standard deviation, in any direction, of a track that a curve is extended through (m)."""
     merge_radius: float = 1.0
     """Distance within which detections of one label belong to one tentative track (m)."""
-    forget_after: Unlimited = 6.0
-    """Time without a detection after which a tentative track is dropped (s)."""
-    max_size: float = 5000.0
-    """Number of control points from which on an open curve grows no further."""
 
     max_unseen: ClassVar[float] = 500.0  # longest stretch of an open curve without any cone, m
     threshold: ClassVar[float] = 0.7  # m from a curve's end below which a tentative track does not extend it

@@ -1,4 +1,4 @@
-"""Settings of a speed profile and a recording for the live viewer."""
+"""Settings of a speed profile."""
 
 from dataclasses import dataclass
 
@@ -17,14 +17,3 @@ class SpeedSettings(Checked):
     """Largest deceleration on a straight, m/s^2."""
     top: Unlimited = 30.0
     """Largest speed, m/s."""
-
-
-@dataclass(frozen=True)
-class RecordingSettings(Checked):
-    """The recording of a run for the live viewer."""
-
-    band_every: int = 10
-    """Cycles from one band to the next, since a band needs the joint covariance of the map; where the map is
-    replaced, it has one too. The curves are shown in every cycle."""
-    samples_per_span: int = 6
-    """Lines in each span of a curve."""

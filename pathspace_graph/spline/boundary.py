@@ -20,6 +20,7 @@ from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
 from .bspline import BSpline, cross, dot, segments_cross, side_of
 
 KNOT_ROUND_OFF = 1e-9  # tolerance of a parameter that lies on a knot (m)
+
 SAME_DIRECTION = 0.5  # least cosine of the angle between a curve and the heading of a vehicle beside it
 
 
@@ -68,9 +69,7 @@ class Boundary:
         self.settings, self.gauge = settings, gauge
         self.degree, self.periodic = settings.degree, periodic
         self.confirmed_end = 0.0  # parameter up to which cones support the curve (m)
-        self.observed: Array = np.zeros(
-            (0, 2)
-        )  # (n, 2) cones that the curve was grown through, map frame (m)
+        self.observed: Array = np.zeros((0, 2))  # (n, 2) cones it was grown through, map frame (m)
         self.cone_parameters: Array = np.zeros(0)  # (n,) their parameters on the curve (m)
         self._set_tables(SpanPolynomials(knots, self.degree, periodic))
 
@@ -158,8 +157,8 @@ class Boundary:
 
     @property
     def trusted(self) -> float:
-        """Parameter up to which foot points are allowed: beyond it, an open curve is extrapolated."""
-        return np.inf if self.periodic else self.confirmed_end + self.settings.confirmed_margin
+        """Parameter up to which foot points are allowed: half a metre past the last cone of an open curve."""
+        return np.inf if self.periodic else self.confirmed_end + 0.5
 
     @property
     def unseen(self) -> float:
@@ -206,14 +205,32 @@ class Boundary:
         The curve is placed again from `from_u` on, by default from its confirmed end. The confirmed end does
         not move.
         """
-        spacing = self.settings.spacing
+        spacing, end = self.settings.spacing, self.confirmed_end
         missing = int(np.ceil((targets_u[-1] - self.tables.high) / spacing - KNOT_ROUND_OFF))
         if missing > 0:
             last = self.knots[-1] + spacing * np.arange(1, missing + 1)
             self._set_tables(self.tables.extended(np.append(self.knots, last)))
-        placement = self._placement(old, targets_u, self.confirmed_end if from_u is None else from_u)
         self.confirmed_end = float(targets_u[-1])
-        return placement
+        from_u = end if from_u is None else from_u
+        kept, held_u = self.settled(old, from_u), np.zeros(0)
+        if old:
+            # four points of the known curve's end keep its shape
+            held_u = np.linspace(max(from_u - self.nominal[0], 0.0), from_u, 4)
+            held_u = np.append(held_u, end) if from_u < end else held_u
+        values, span = self.tables.evaluate(np.concatenate([held_u, targets_u]))
+        columns = self.columns(span)
+        first = max(min(int(columns.min()), kept - 2), 0)  # earlier rows have no free column
+        weight, held, bent = 0.1, len(held_u), len(columns)  # the weight is that of second differences
+        matrix = np.zeros((bent, self.size - first))
+        np.put_along_axis(matrix, columns - first, values[0], axis=1)
+        matrix = np.concatenate([matrix, weight * smoothness_matrix(self.abscissae[first:], None)])
+        fit = np.asarray(np.linalg.pinv(matrix[:, kept - first :]), float)
+        design = np.zeros((held, old - first))  # basis of the old curve, whose control points end at `old`
+        known = np.minimum(columns[:held], old - 1) - first
+        np.add.at(design, (np.arange(held)[:, None], known), values[0][:held])
+        by_known = fit[:, :held] @ design
+        by_known[:, : kept - first] -= fit @ matrix[:, : kept - first]
+        return Placement(first, kept, by_known, fit[:, held:bent], weight * fit[:, bent:])
 
     def settled(self, size: int, u: float | None = None) -> int:
         """Number of the first `size` control points that act before u, by default `confirmed_end`."""
@@ -231,28 +248,6 @@ class Boundary:
         """Remove all cones but the first `kept`, up to which the curve stays confirmed."""
         self.confirmed_end = float(self.cone_parameters[kept - 1])
         self.observed, self.cone_parameters = self.observed[:kept], self.cone_parameters[:kept]
-
-    def _placement(self, old: int, targets_u: Array, from_u: float) -> Placement:
-        """Fit the control points that act beyond `from_u` to targets at parameters (k,) and to the curve."""
-        kept, held_u = self.settled(old, from_u), np.zeros(0)
-        if old:
-            held_u = np.linspace(max(from_u - self.nominal[0], 0.0), from_u, self.settings.fit_held)
-            if from_u < self.confirmed_end:
-                held_u = np.append(held_u, self.confirmed_end)
-        values, span = self.tables.evaluate(np.concatenate([held_u, targets_u]))
-        columns = self.columns(span)
-        first = max(min(int(columns.min()), kept - 2), 0)  # earlier rows have no free column
-        weight, held, bent = self.settings.fit_smoothness, len(held_u), len(columns)
-        matrix = np.zeros((bent, self.size - first))
-        np.put_along_axis(matrix, columns - first, values[0], axis=1)
-        matrix = np.concatenate([matrix, weight * smoothness_matrix(self.abscissae[first:], None)])
-        fit = np.asarray(np.linalg.pinv(matrix[:, kept - first :]), float)
-        design = np.zeros((held, old - first))  # basis of the old curve, whose control points end at `old`
-        known = np.minimum(columns[:held], old - 1) - first
-        np.add.at(design, (np.arange(held)[:, None], known), values[0][:held])
-        by_known = fit[:, :held] @ design
-        by_known[:, : kept - first] -= fit @ matrix[:, : kept - first]
-        return Placement(first, kept, by_known, fit[:, held:bent], weight * fit[:, bent:])
 
 
 def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
@@ -289,11 +284,6 @@ def relocate(boundary: Boundary, control_points: Array, pose: Array, room: float
 
 # --- whether boundaries cross ----------------------------------------------------------------------------
 
-NO_PATH: Final = np.zeros((0, 2))
-LEVEL_PATH_STEP: Final = 1.0  # step of the path in which crossings with itself are searched (m)
-LEVEL_SINE: Final = 0.7  # least sine of the angle of a level crossing; laps on one road cross at less
-LEVEL_CROSSING: Final = 8.0  # largest distance of crossing boundaries from the crossing of the path (m)
-
 
 def sampled(spline: BSpline, step: float) -> Array:
     """Sample points (n, 2) of a spline from its beginning to its end, about `step` (m) apart."""
@@ -301,19 +291,14 @@ def sampled(spline: BSpline, step: float) -> Array:
     return spline.evaluate(np.linspace(low, high, max(int((high - low) / step), 1) + 1))
 
 
-def boundaries_cross(splines: Mapping[int, BSpline], step: float, path: Array = NO_PATH) -> bool:
-    """Whether the boundaries, sampled at a step (m), cross elsewhere than where the path crosses itself."""
+def boundaries_cross(splines: Mapping[int, BSpline], step: float, path: Array | None = None) -> bool:
+    """Whether the boundaries, sampled at a step (m), cross elsewhere than where the path driven does."""
     found = polyline_crossings(sampled(splines[LEFT], step), sampled(splines[RIGHT], step))
-    return not at_level_crossing(found, path).all()
-
-
-def at_level_crossing(points: Array, path: Array) -> BoolArray:
-    """Whether a driven path (n, 2) crosses itself near each point (m, 2)."""
-    if len(points) == 0 or len(path) < 2:
-        return np.zeros(len(points), bool)
-    _, kept = np.unique(path_lengths(path) // LEVEL_PATH_STEP, return_index=True)
-    places = KDTree(polyline_crossings(path[kept], path[kept], LEVEL_SINE))
-    return np.asarray(places.query(points)[0] < LEVEL_CROSSING)
+    if len(found) == 0 or path is None or len(path) < 2:
+        return len(found) > 0
+    _, kept = np.unique(path_lengths(path) // 1.0, return_index=True)  # of the path, a pose per metre
+    level = KDTree(polyline_crossings(path[kept], path[kept], 0.7))  # laps on one road cross at a less sine
+    return bool(np.max(level.query(found)[0]) >= 8.0)  # a road's boundaries cross within 8 m of its middle
 
 
 def polyline_crossings(a: Array, b: Array, sine: float = 0.0) -> Array:
@@ -337,21 +322,13 @@ def crossing_segments(a: Array, b: Array) -> tuple[IntArray, IntArray, Array]:
     return i, j, before / (before - after)
 
 
-# --- level crossings, and crossings that are told --------------------------------------------------------
+# --- where the vehicle crossed a boundary; lengths are relative to its median distance from them ------------
 
-
-COARSE: Final = 8  # number of samples for each control point, for the median distance
 CROSSING_STEP: Final = 0.15  # distance of the samples of curves and drive
-DRIVE_GAP: Final = 5.0  # longest step of a drive between two poses; beyond, the path between is unknown
 CROSSED_DEPTH: Final = 0.35  # least depth beyond a boundary that counts as across: drivers cut corners
 ROADSIDE: Final = 2.5  # largest distance of a road's boundary from the drive along it
 PASSES_APART: Final = 15.0  # least length driven between two passes of one place
 ALONG_COSINE: Final = 0.9  # least cosine of the angle between a boundary and the drive along it
-PARTED_COSINE: Final = 0.87  # largest cosine of the angle between two parts of the drive that cross
-MEETING_REACH: Final = 7.0  # distance from such a crossing within which boundaries may be crossed
-MEETING_DISTANCE: Final = 0.5  # largest distance of two parts of the drive that cross
-MEETING_SAMPLES: Final = 500  # largest number of samples of the drive tested there
-ON_ROAD_SHARE: Final = 0.5  # least share of a stretch on the road that has another boundary beside it
 
 
 class Crossing(NamedTuple):
@@ -392,7 +369,7 @@ def crossed_boundaries(
     path, before = path[kept], before[kept]
     if len(path) < 2 or not curves:
         return []
-    coarse = [curve.evaluate(np.linspace(*curve.domain, COARSE * curve.size)) for curve in curves.values()]
+    coarse = [curve.evaluate(np.linspace(*curve.domain, 8 * curve.size)) for curve in curves.values()]
     aside = float(np.median([KDTree(points).query(path)[0] for points in coarse]))
     drive = _drive(path, np.diff(before) > 0, aside)
     lines = {label: _line(curve, CROSSING_STEP * aside) for label, curve in curves.items()}
@@ -420,7 +397,7 @@ def _line(curve: BSpline, step: float) -> _Way:
 def _drive(path: Array, unknown: BoolArray, aside: float) -> _Way:
     """Sample a path (n, 2); the way to the next pose may be `unknown` (n - 1,)."""
     length = path_lengths(path)
-    missing = np.flatnonzero(unknown | (np.diff(length) > DRIVE_GAP * aside)) + 1
+    missing = np.flatnonzero(unknown | (np.diff(length) > 5.0 * aside)) + 1  # the path between is unknown
     known = [rows for rows in np.split(length, missing) if len(rows) > 1]
     at = [np.linspace(rows[0], rows[-1], int(np.ptp(rows) / (CROSSING_STEP * aside)) + 2) for rows in known]
     ends = np.cumsum([0, *map(len, at)]).tolist()
@@ -459,7 +436,7 @@ def _crossings(label: int, lines: Mapping[int, _Way], drive: _Way, aside: float)
             if k == (len(changes) - 1 if leaves else 0):  # off the road, the drive is along no other boundary
                 others = [(other, own) for other, own in lines.items() if other != label]
                 along = [_beside(*other, drive, beyond, aside).mean() for other in others]
-                allowed |= max(along, default=1.0) < ON_ROAD_SHARE
+                allowed |= max(along, default=1.0) < 0.5
             allowed |= not line.closed and _is_of_another_lap(one, line.heading[on_line], drive, aside)
             if not allowed:
                 found.append(one)
@@ -485,13 +462,13 @@ def _beside(label: int, line: _Way, drive: _Way, rows: slice, aside: float) -> B
 
 def _meets_itself(place: Array, drive: _Way, aside: float) -> bool:
     """Whether the drive crosses itself near a place (2,)."""
-    near = np.flatnonzero(np.hypot(*(drive.points - place).T) < MEETING_REACH * aside)
-    near = near[:: 1 + len(near) // MEETING_SAMPLES]
+    near = np.flatnonzero(np.hypot(*(drive.points - place).T) < 7.0 * aside)
+    near = near[:: 1 + len(near) // 500]
     points, heading, length = drive.points[near], drive.heading[near], drive.length[near]
-    parted = np.abs(heading @ heading.T) < PARTED_COSINE
+    parted = np.abs(heading @ heading.T) < 0.87  # two parts that cross at 30 degrees at least
     parted &= np.abs(length[:, None] - length) > PASSES_APART * aside
     offset = points[:, None] - points
-    return bool((parted & (np.hypot(offset[..., 0], offset[..., 1]) < MEETING_DISTANCE * aside)).any())
+    return bool((parted & (np.hypot(offset[..., 0], offset[..., 1]) < 0.5 * aside)).any())
 
 
 def _is_of_another_lap(one: Crossing, heading: Array, drive: _Way, aside: float) -> bool:

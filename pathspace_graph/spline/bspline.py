@@ -19,15 +19,8 @@ from pathspace_graph.factors.bspline import (
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.se2 import left_of
 
-_PERIODIC_TOLERANCE: Final = 1e-9  # largest difference of repeated values, relative to 1 + the largest value
 _FOOT_GRID: Final = 8  # grid points on each span of a foot-point search over the whole curve
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(12)
-_ARC_NEWTON_STEPS: Final = 4  # Newton steps that invert the arc length, from a table on the same grid
-_BERNSTEIN: Final = np.array(
-    [[1.0, 0.0, 0.0, 0.0], [-3.0, 3.0, 0.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]
-)
-"""Coefficients (power, basis function) of the cubic Bernstein polynomials."""
-_SHORTEST_EXTENSION: Final = 1e-3  # shortest new knot interval, relative to the mean one
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,15 +44,6 @@ class BSpline:
     def __post_init__(self) -> None:
         object.__setattr__(self, "knots", np.array(self.knots, dtype=np.float64))
         object.__setattr__(self, "control_points", np.array(self.control_points, dtype=np.float64))
-        self._check_shapes()
-        if self.periodic:
-            self._check_period()
-
-    def __repr__(self) -> str:
-        ends = "periodic" if self.periodic else "open"
-        return f"{type(self).__name__}({ends}, degree {self.degree}, {self.size} control points)"
-
-    def _check_shapes(self) -> None:
         points, knots = self.control_points, self.knots
         if self.degree < 1:
             raise SettingsError(f"a spline's degree must be at least 1, not {self.degree}")
@@ -81,22 +65,26 @@ class BSpline:
             raise SettingsError(f"knots must not decrease, but knot {int(steps.argmin()) + 1} does")
         if steps[self.degree] <= 0.0 or steps[-self.degree - 1] <= 0.0:
             raise SettingsError("the first and the last knot interval of a domain must not be empty")
-
-    def _check_period(self) -> None:
-        p, m = self.degree, len(self.control_points) - self.degree
+        if not self.periodic:
+            return
+        p, m = self.degree, len(points) - self.degree
         if m <= p:
             raise SettingsError(
                 f"a periodic spline of degree {p} needs more than {p} distinct points, not {m}"
             )
         low, high = self.domain
-        knot_error = np.abs(self.knots[m:] - self.knots[: 2 * p + 1] - (high - low)).max()
-        point_error = np.abs(self.control_points[m:] - self.control_points[:p]).max()
-        if knot_error > _PERIODIC_TOLERANCE * (1.0 + np.abs(self.knots).max()):
+        knot_error = np.abs(knots[m:] - knots[: 2 * p + 1] - (high - low)).max()
+        point_error = np.abs(points[m:] - points[:p]).max()
+        if knot_error > 1e-9 * (1.0 + np.abs(knots).max()):
             raise SettingsError(f"knots of a periodic spline must repeat, but differ by {knot_error:.3g}")
-        if point_error > _PERIODIC_TOLERANCE * (1.0 + np.abs(self.control_points).max()):
+        if point_error > 1e-9 * (1.0 + np.abs(points).max()):
             raise SettingsError(
                 f"the last {p} control points must repeat the first, not be {point_error:.3g} off"
             )
+
+    def __repr__(self) -> str:
+        ends = "periodic" if self.periodic else "open"
+        return f"{type(self).__name__}({ends}, degree {self.degree}, {self.size} control points)"
 
     @classmethod
     def open_uniform(
@@ -131,7 +119,8 @@ class BSpline:
         before, after = points[:-1] + third * slopes[:-1], points[1:] - third * slopes[1:]
         pieces = np.stack([points[:-1], before, after], axis=1)
         knots = np.concatenate([u[:1], np.repeat(u, 3), u[-1:]])
-        basis = np.broadcast_to(_BERNSTEIN[:, None], (4, 3 * count - 2, 4))
+        cubic = np.array([[1.0, 0, 0, 0], [-3.0, 3.0, 0, 0], [3.0, -6.0, 3.0, 0], [-1.0, 3.0, -3.0, 1.0]])
+        basis = np.broadcast_to(cubic[:, None], (4, 3 * count - 2, 4))  # by power, span and function
         control_points = np.concatenate([pieces.reshape(-1, cls.DIMENSION), points[-1:]])
         return cls.on(SpanPolynomials(knots, 3, False, basis), control_points)
 
@@ -248,7 +237,7 @@ class BSpline:
         lengths = np.clip(lengths, 0.0, self.length())
         grid = np.linspace(low, high, _FOOT_GRID * (len(self.breaks) - 1) + 1)
         u = np.interp(lengths, self.arc_length(grid), grid)
-        for _ in range(_ARC_NEWTON_STEPS):
+        for _ in range(4):  # Newton steps
             speed = np.linalg.norm(self.evaluate(u, 1), axis=1)
             error = lengths - self.arc_length(u)
             u = np.clip(u + np.divide(error, speed, out=np.zeros_like(u), where=speed > 0.0), low, high)
@@ -268,7 +257,8 @@ class BSpline:
 
     def with_end_knots(self, knots: Array) -> "BSpline":
         """Return the same curve, exactly, on knots that differ only outside the domain."""
-        self._refuse_periodic("change the ends of")
+        if self.periodic:
+            raise SettingsError("cannot change the ends of a periodic spline: it has no ends")
         matrix = end_change_matrix(self.knots, self.degree, knots)
         return BSpline(knots, matrix @ self.control_points, self.degree)
 
@@ -293,13 +283,14 @@ class BSpline:
         mean = (high - low) / (len(self.breaks) - 1)
         length = self.length()
         interval = chord * (high - low) / length if length > 0.0 else mean
-        new_end = high + max(interval, _SHORTEST_EXTENSION * mean)
+        new_end = high + max(interval, 1e-3 * mean)
         kept = self.knots[: len(self.control_points) + 1]
         return np.concatenate([kept, np.full(self.degree + 1, new_end)])
 
     def extend_to(self, point: Array) -> "BSpline":
         """Extend the curve to a point (2,), its new last control point (Hu et al. 2002)."""
-        self._refuse_periodic("extend")
+        if self.periodic:
+            raise SettingsError("cannot extend a periodic spline: it has no ends")
         knots = self.extension_knots(point)
         kept = end_change_matrix(self.knots, self.degree, knots) @ self.control_points
         return BSpline(knots, np.concatenate([kept, np.reshape(point, (1, 2))]), self.degree)
@@ -320,10 +311,6 @@ class BSpline:
         normal = self.normal_unit(u)
         variance = np.einsum("ka,kab,kb->k", normal, self.covariance_at(u, joint_covariance), normal)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-
-    def _refuse_periodic(self, what: str) -> None:
-        if self.periodic:
-            raise SettingsError(f"cannot {what} a periodic spline: it has no ends")
 
 
 def end_change_matrix(knots: Array, degree: int, new_knots: Array) -> Array:

@@ -22,7 +22,6 @@ from .knots import SAMPLED_WEIGHT, LeastSquares
 RIBBON: Final = 3  # entries of a ribbon's control point: x, y (m, map frame) and half the width h (m)
 SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}  # side of the centre line of each label's edge
 SAMPLE_STEP: Final = 0.5  # distance of the samples of boundaries, lines and fitted edges (m)
-_EDGE_BREAKS: Final = 2  # knot intervals of a fitted edge for each of the ribbon; an edge is no B-spline
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,7 +60,8 @@ class Ribbon(BSpline):
         turned = (half / speed * slope)[:, None, :, None]
         by_control[:, :, :, :2] -= t[:, :, None, None] * turned * n[:, None, None, :]
         by_control[:, :, :, 2] = side * n[:, :, None] * B[:, None, :]
-        blank = BSpline.even(low, high, _EDGE_BREAKS * len(self.tables.starts), self.periodic, self.degree)
+        # twice the knots of the ribbon, since an edge is no B-spline
+        blank = BSpline.even(low, high, 2 * len(self.tables.starts), self.periodic, self.degree)
         fit = LeastSquares(blank, u, SAMPLED_WEIGHT)
         by_ribbon = fit.solve(by_control.reshape(len(u), -1)).reshape(2 * blank.size, -1)
         return blank.with_points(fit.solve(at[:, :2] + half * n)), by_ribbon
@@ -69,16 +69,10 @@ class Ribbon(BSpline):
 
 # --- the line between two boundaries ---------------------------------------------------------------------
 
-RIBBON_SPACING: Final = 3.0  # distance of the knots of a planner's line (m); shorter kinks are smoothed
 MOST_SAMPLES: Final = 200_000  # largest number of samples of a boundary; bounds the memory
 _FEWEST_SPANS: Final = 4  # smallest number of samples of a boundary and of knot intervals of a line
-_PAIR_STARTS: Final = 200  # number of samples of the left boundary tried as the start of the march
-_PAIRS_NEAR: Final = 12  # samples on either side of a pair in which segments are tested for a crossing
-_RIBBON_ROUNDS: Final = 3  # number of moves of the line to the middle between the crossings of its normals
-_CROSSING_STEPS: Final = 8  # number of Newton steps to the crossing of a normal and a boundary
 _CROSSED: Final = 1e-6  # tolerance of a point where a normal crosses a boundary (m)
 _LEAST_COSINE: Final = 0.1  # least cosine of the angle between boundary and line at a crossing
-_FARTHEST_ACROSS: Final = 1.5  # largest distance of a crossing, relative to the paired sample's
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,17 +107,25 @@ class CentreCurve:
     def crossings(self, at: Array) -> "list[NormalCrossing]":
         """Find where the normals at parameters `at` (k,) of the ribbon cross each boundary.
 
-        Where a normal crosses none, the crossing is half the width away.
+        Where a normal crosses none, or far from the paired sample, the crossing is half the width away.
         """
         points, tangent = self.ribbon.centre.evaluate(at), self.ribbon.centre.tangent_unit(at)
-        half, found = self.ribbon.half_width(at), []
+        half, normal, found = self.ribbon.half_width(at), left_of(tangent), []
         for side, spline in enumerate(self.sides):
-            begin = np.interp(at, *self.table(side).T[::-1])
-            far = _FARTHEST_ACROSS * np.linalg.norm(spline.evaluate(begin) - points, axis=1)
-            one = normal_crossing(spline, begin, points, tangent)
-            good = one.good & (SIDE[side] * one.offset > 0.0) & (np.abs(one.offset) <= far)
-            u, offset = np.where(good, one.u, begin), np.where(good, one.offset, SIDE[side] * half)
-            found.append(replace(one, u=u, offset=offset, good=good))
+            u = begin = np.interp(at, *self.table(side).T[::-1])
+            far = 1.5 * np.linalg.norm(spline.evaluate(begin) - points, axis=1)
+            for _ in range(8):  # Newton steps
+                point, first = spline.derivatives(u, 1)
+                ahead, slope = dot(point - points, tangent), dot(first, tangent)
+                if (np.abs(ahead) <= _CROSSED).all():
+                    break
+                u = u - np.divide(ahead, slope, out=np.zeros_like(u), where=slope != 0.0)
+                u = u if spline.periodic else np.clip(u, *spline.domain)
+            offset = dot(point - points, normal)
+            good = (np.abs(ahead) <= _CROSSED) & (slope >= _LEAST_COSINE * np.hypot(*first.T))
+            good &= (SIDE[side] * offset > 0.0) & (np.abs(offset) <= far)
+            offset = np.where(good, offset, SIDE[side] * half)
+            found.append(NormalCrossing(spline, np.where(good, u, begin), normal, offset, good))
         return found
 
     @cached_property
@@ -166,24 +168,8 @@ class NormalCrossing:
         return sparse_rows(entries, 2 * (columns + first)[:, :, None] + np.arange(2), 2 * size)
 
 
-def normal_crossing(spline: BSpline, u: Array, points: Array, tangent: Array) -> NormalCrossing:
-    """Find where the normals of a line, at points (k, 2) with unit tangents, cross a boundary near u (k,)."""
-    low, high = spline.domain
-    for _ in range(_CROSSING_STEPS):
-        point, first = spline.derivatives(u, 1)
-        ahead, slope = dot(point - points, tangent), dot(first, tangent)
-        if (np.abs(ahead) <= _CROSSED).all():
-            break
-        u = u - np.divide(ahead, slope, out=np.zeros_like(u), where=slope != 0.0)
-        u = u if spline.periodic else np.minimum(np.maximum(u, low), high)
-    offset, normal = point - points, left_of(tangent)
-    good = np.abs(ahead) <= _CROSSED
-    good &= dot(first, tangent) >= _LEAST_COSINE * np.hypot(*first.T)
-    return NormalCrossing(spline, u, normal, dot(offset, normal), good)
-
-
-def find_line(left: BSpline, right: BSpline, spacing: float = RIBBON_SPACING) -> CentreCurve:
-    """Find the line between two boundaries, on knots about `spacing` (m) apart.
+def find_line(left: BSpline, right: BSpline, spacing: float = 3.0) -> CentreCurve:
+    """Find the line between two boundaries, on knots about `spacing` (m) apart, which smooths shorter kinks.
 
     Samples of both are paired along the strip between them, always over the shorter diagonal. A ribbon is
     fitted to the midpoints, then to the midpoints between the crossings of its normals with the boundaries.
@@ -209,7 +195,7 @@ def find_line(left: BSpline, right: BSpline, spacing: float = RIBBON_SPACING) ->
     beside = np.interp(u, lengths, first), np.interp(u, lengths, second)
     fit = LeastSquares(blank, u, SAMPLED_WEIGHT)
     line = CentreCurve(blank.with_points(fit.solve(middles)), u, (left, right), beside)
-    for _ in range(_RIBBON_ROUNDS):
+    for _ in range(3):  # to the middle between the crossings of its normals
         one, other = line.crossings(u)
         good = one.good & other.good
         middle = 0.5 * (one.offset + other.offset)[:, None] * one.normal + line.ribbon.centre.evaluate(u)
@@ -248,9 +234,7 @@ def _sampled(spline: BSpline) -> SampledBoundary:
     return SampledBoundary(spline, u, lengths, *spline.derivatives(u, 1))
 
 
-def paired(
-    one: SampledBoundary, other: SampledBoundary, starts: int = _PAIR_STARTS
-) -> tuple[IntArray, IntArray]:
+def paired(one: SampledBoundary, other: SampledBoundary, starts: int = 200) -> tuple[IntArray, IntArray]:
     """Pair the samples of a left and a right boundary that face each other, in driving order.
 
     The march begins at the nearest pair that faces each other, the left sample on the left, of about `starts`
@@ -310,7 +294,7 @@ def _march(
 def _check_apart(lefts: Array, rights: Array, i: IntArray, j: IntArray, closed: bool) -> None:
     """Raise a SettingsError if the boundaries cross near a pair of samples that face each other."""
     mode: Literal["wrap", "clip"] = "wrap" if closed else "clip"
-    near = j[:, None] + np.arange(-_PAIRS_NEAR, _PAIRS_NEAR + 1)
+    near = j[:, None] + np.arange(-12, 13)
     p, q = (lefts.take(i[:, None] + k, axis=0, mode=mode) for k in range(2))
     r, s = (rights.take(near + k, axis=0, mode=mode) for k in range(2))
     crossed = segments_cross(p, q, r, s).any(axis=1)

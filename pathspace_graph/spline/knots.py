@@ -14,12 +14,8 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.spline.bspline import BSpline, sparse_rows
 
-CUBIC: Final = 3  # default degree
-ENERGY_WEIGHT: Final = (
-    1e-3  # weight (m^3) of the integral of |S''|^2, relative to the squared distances (m^2)
-)
+ENERGY_WEIGHT: Final = 1e-3  # weight (m^3) of the integral of |S''|^2, relative to squared distances (m^2)
 SAMPLED_WEIGHT: Final = 1e-8  # the same for dense samples of a curve: only gaps between them are bent by it
-REFITS: Final = 4  # least-squares fits on each set of knots, with refreshed foot points
 
 
 class LeastSquares:
@@ -49,9 +45,7 @@ def energy_rows(spline: BSpline) -> csr_array:
     return sparse_rows(values * np.sqrt(half[:, None] * weights).reshape(-1, 1), columns, spline.size)
 
 
-def fit_spline(
-    points: Array, breaks: Array | int, periodic: bool, degree: int = CUBIC
-) -> tuple[BSpline, Array]:
+def fit_spline(points: Array, breaks: Array | int, periodic: bool, degree: int = 3) -> tuple[BSpline, Array]:
     """Fit a spline to ordered points (k, 2) in m, by least squares; return it and their parameters (k,).
 
     Parameters begin at chord lengths and move to the foot points. The knots are `breaks`, in chord lengths,
@@ -69,7 +63,7 @@ def fit_spline(
         breaks = np.linspace(0.0, lengths[-1], count + 1)
     spline, feet = _frame(breaks, periodic, degree), lengths[: len(points)]
     reach = (breaks[-1] - breaks[0]) / max(len(breaks) - 1, len(points))
-    for _ in range(REFITS):
+    for _ in range(4):  # with refreshed foot points
         u = feet
         spline = spline.with_points(LeastSquares(spline, u, ENERGY_WEIGHT).solve(points))
         search = u - reach, u + reach, 0.1 * reach
@@ -80,9 +74,6 @@ def fit_spline(
 # --- knots by the cones ----------------------------------------------------------------------------------
 
 
-EVEN_WEIGHT: Final = 1e-9  # weight of the squared interval left by a removal; decides between equal costs
-SIZE_MARGIN: Final = 0.1  # least relative gain in the sum of squares for which a smaller curve is chosen
-NEGLIGIBLE_SHARE: Final = 1e-12  # least relative effect of a removal that counts; it decays from knot to knot
 COINCIDENT_CONES: Final = 1e-9  # largest difference of parameters of cones that share a knot (m)
 
 
@@ -104,13 +95,13 @@ class Thinned:
 def chosen_breaks(points: Array, periodic: bool, degree: int, least: int, most: int) -> Thinned:
     """Choose a curve of `thin` with `least` to `most` control points by cross-validation.
 
-    It is the largest, unless a smaller one predicts left-out points better by `SIZE_MARGIN`. BIC would take a
+    It is the largest, unless a smaller one predicts left-out points better by a tenth. BIC would take a
     knot for every cone, since the residuals vanish. Cones are 0.066 m from the curve, 0.107 m with knots by
     curvature.
     """
     path = list(thin(points, periodic, degree, least))
     within = [curve for curve in path if curve.size <= most] or path[-1:]
-    return min(within, key=lambda curve: (1.0 if curve is within[0] else 1.0 + SIZE_MARGIN) * curve.crossed)
+    return min(within, key=lambda curve: (1.0 if curve is within[0] else 1.1) * curve.crossed)
 
 
 def fewest_breaks(points: Array, periodic: bool, degree: int, least: int, tolerance: float) -> Thinned:
@@ -157,10 +148,10 @@ def thin(points: Array, periodic: bool, degree: int, least: int) -> Iterator[Thi
         if len(remaining):
             jump = values[remaining]
             cost = (jump[:, 0] ** 2 + jump[:, 1] ** 2) / spread[remaining, remaining]
-            removed = int((cost + EVEN_WEIGHT * (kept[2:] - kept[:-2]) ** 2).argmin())
+            removed = int((cost + 1e-9 * (kept[2:] - kept[:-2]) ** 2).argmin())
             k, column = remaining[removed], spread[:, remaining[removed]].copy()
             share = column / column[k]
-            near = np.flatnonzero(stays & (np.abs(share) > NEGLIGIBLE_SHARE))  # knots and points that feel it
+            near = np.flatnonzero(stays & (np.abs(share) > 1e-12))  # knots and points that feel it
             stays[k] = False
             inner, outer = near[near < n], near[near >= n]
             leverage = leverage.copy()

@@ -67,8 +67,6 @@ class Line:
 
 # --- the centre line of a map ----------------------------------------------------------------------------
 
-_FEWEST_POINTS: Final = 4  # smallest number of points of a line
-_NORMALS_APART: Final = 10  # largest number of points between normals that must not cross
 _WIDTH_SHARE: Final = 0.95  # largest width, as a share of the distance to where two normals cross
 
 
@@ -124,7 +122,7 @@ def centre_line(left: BSpline, right: BSpline, covariance: Array | None, step: f
     line, closed = find_line(left, right), left.periodic
     centre = line.ribbon.centre
     length = centre.length()
-    count = max(round(length / step), _FEWEST_POINTS)
+    count = max(round(length / step), 4)
     arc_length = np.linspace(0.0, length, count + 1)
     u, own = centre.parameters_at(arc_length), slice(count if closed else None)
     points, tangent, crossings = centre.evaluate(u)[own], centre.tangent_unit(u), line.crossings(u)
@@ -151,13 +149,13 @@ def centre_line(left: BSpline, right: BSpline, covariance: Array | None, step: f
 
 
 def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) -> list[Array]:
-    """Shorten the widths to the left and right, so that normals of neighbouring points do not meet.
+    """Shorten the widths to the left and right, so that normals of points up to ten apart do not meet.
 
     The normals p + a n and q + b m meet where a n - b m = q - p.
     """
     left, right = (width.copy() for width in widths)
     count = len(points)
-    for apart in range(1, min(_NORMALS_APART, count - 1) + 1):
+    for apart in range(1, min(10, count - 1) + 1):
         i = np.arange(count if closed else count - apart)
         j = (i + apart) % count
         turn, way = cross(normal[i], normal[j]), points[j] - points[i]
@@ -217,12 +215,7 @@ def _along(a: Array, moved: Array) -> Array:
 # --- the next metres of a drive --------------------------------------------------------------------------
 
 _SAMPLES_BEHIND: Final = 3.0  # distance of the first sample behind the vehicle (m), which may stand askew
-_OUTER_LENGTH: Final = 1.8  # largest length of a turn's outer boundary, relative to the centre line
-_PAIR_STARTS: Final = 16  # number of samples of the left boundary at which the pairs may begin
-_STRIDE: Final = 2  # stride of the samples that are paired
-_SETTLING_STEPS: Final = 8  # largest number of Newton steps of a line; two are mostly enough
 _SETTLED: Final = 1e-3  # largest difference of the distances from both boundaries on the line (m)
-_LARGEST_GAP: Final = 2.0  # largest distance of neighbours, in steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,15 +280,23 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
     if len(known) < len(BOUNDARIES):
         return nothing
     stretches = known[LEFT], known[RIGHT]
-    i, j = paired(*stretches, _PAIR_STARTS)
+    i, j = paired(*stretches, starts=16)
     if len(i) < 2:
         return nothing
     (left, first), (right, second) = stretches[0].at(i), stretches[1].at(j)
     pairs = np.column_stack([0.5 * (left + right), first, second])
     # the pairs advance on one side at a time: without the mean of two, their midpoints zigzag
     pairs = np.concatenate([pairs[:1], 0.5 * (pairs[1:] + pairs[:-1]), pairs[-1:]])
-    points, *places = _from_beside(pairs, pose[:2], distance, step)
-    for _ in range(_SETTLING_STEPS):
+    # at even steps, from beside the vehicle on
+    edges, offset = np.diff(pairs[:, :2], axis=0), pose[:2] - pairs[:-1, :2]
+    share = np.clip(dot(offset, edges) / np.maximum(dot(edges, edges), np.finfo(float).tiny), 0.0, 1.0)
+    away = offset - share[:, None] * edges
+    nearest, lengths = int(dot(away, away).argmin()), path_lengths(pairs)
+    begin = lengths[nearest] + share[nearest] * (lengths[nearest + 1] - lengths[nearest])
+    at = begin + step * np.arange(int(min(distance, lengths[-1] - begin) / step + _SETTLED) + 1)
+    x, y, *places = (np.interp(at, lengths, values) for values in pairs.T)
+    points = np.column_stack([x, y])
+    for _ in range(8):  # Newton steps; two are mostly enough
         feet = [
             foot_points(one.spline.tables, one.spline.control_points, points, u - step, u + step, SAMPLE_STEP)
             for one, u in zip(stretches, places, strict=True)
@@ -311,7 +312,7 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
         points = points - (off / np.maximum(dot(both, both), np.finfo(float).tiny))[:, None] * both
     good = inside & (np.abs(off) <= _SETTLED) & (feet[0].distance < 0.0) & (feet[1].distance > 0.0)
     steps = np.append(0.0, np.hypot(*np.diff(points, axis=0).T))
-    good &= steps <= _LARGEST_GAP * step
+    good &= steps <= 2.0 * step
     n = len(good) if good.all() else int(good.argmin())
     points, normal = points[:n], both[:n] / np.hypot(*both[:n].T)[:, None]
     heading = np.arctan2(-normal[:, 0], normal[:, 1]) - pose[2]
@@ -353,7 +354,8 @@ def _stretch(curve: CurveAhead, distance: float) -> _Stretch:
     differs from the curve by far less than a mm.
     """
     tables, beside = curve.tables, curve.beside
-    begin, end = beside - _SAMPLES_BEHIND, beside + _OUTER_LENGTH * distance + _SAMPLES_BEHIND
+    # the outer boundary of a turn is up to 1.8 times as long as the centre line
+    begin, end = beside - _SAMPLES_BEHIND, beside + 1.8 * distance + _SAMPLES_BEHIND
     if tables.periodic:
         end = min(end, begin + tables.length)  # at most one period
     else:
@@ -378,27 +380,10 @@ def _stretch(curve: CurveAhead, distance: float) -> _Stretch:
     if len(tentative):
         beyond = np.linspace(end, nodes[-1], ceil((nodes[-1] - end) / SAMPLE_STEP) + 1)[1:]
         u, places = np.append(u, beyond), np.concatenate([places, spline.derivatives(beyond, 2)], axis=1)
-    some = np.append(np.arange(0, len(u) - 1, _STRIDE), len(u) - 1)
+    some = np.append(np.arange(0, len(u) - 1, 2), len(u) - 1)  # every other sample is paired
     u, (points, first, second) = u[some], places[:, some]
     curvature = cross(first, second) / np.hypot(*first.T) ** 3
     return _Stretch(spline, u, u, points, first, curvature, end if curve.confirmed else -np.inf)
-
-
-def _from_beside(line: Array, position: Array, distance: float, step: float) -> list[Array]:
-    """Resample a line of points and parameters (n, 4) at even steps, from beside a position (2,) on.
-
-    The results are points (k, 2), and the two parameters (k,) of each.
-    """
-    edges, offset = np.diff(line[:, :2], axis=0), position - line[:-1, :2]
-    squares = np.maximum(dot(edges, edges), np.finfo(float).tiny)
-    share = np.clip(dot(offset, edges) / squares, 0.0, 1.0)
-    away = offset - share[:, None] * edges
-    nearest, lengths = int(dot(away, away).argmin()), path_lengths(line)
-    begin = lengths[nearest] + share[nearest] * (lengths[nearest + 1] - lengths[nearest])
-    count = int(min(distance, lengths[-1] - begin) / step + _SETTLED)
-    at = begin + step * np.arange(count + 1)
-    x, y, *places = (np.interp(at, lengths, values) for values in line.T)
-    return [np.column_stack([x, y]), *places]
 
 
 # --- speed -----------------------------------------------------------------------------------------------
@@ -435,8 +420,15 @@ def speed_profile(
     given speeds (m/s), by default as fast as its curvature allows. SettingsError for fewer than two points,
     or an impossible speed.
     """
-    settings = settings or SpeedSettings()
-    _check_ends(line, begin, end)
+    settings, limits = settings or SpeedSettings(), [one for one in (begin, end) if one is not None]
+    if len(line.curvature) < 2:
+        found = len(line.curvature)
+        raise SettingsError(f"a speed profile: expected a line of at least 2 points, found {found}")
+    if line.closed and limits:
+        raise SettingsError("a speed profile: expected an open line for a begin or end speed, found a loop")
+    for limit in limits:
+        if not 0.0 <= limit < np.inf:
+            raise SettingsError(f"a speed profile: expected a speed (m/s) of at least 0, found {limit:g}")
     count, steps = len(line.curvature), np.diff(line.arc_length)
     bend = np.abs(line.curvature) / settings.lateral
     squares = np.minimum(1.0 / np.maximum(bend, np.finfo(float).tiny), settings.top**2)
@@ -445,8 +437,8 @@ def speed_profile(
         around = np.arange(first, first + count + 1) % count
         steps = np.append(steps, line.length - line.arc_length[-1])[around[:-1]]
         squares, bend = squares[around], bend[around]
-    for at, limit in ((0, begin), (-1, end)):
-        squares[at] = squares[at] if limit is None else min(squares[at], limit**2)
+    for at, most in ((0, begin), (-1, end)):
+        squares[at] = squares[at] if most is None else min(squares[at], most**2)
     squares = _accelerated(squares, steps, bend, settings.forward)
     squares = _accelerated(squares[::-1], steps[::-1], bend[::-1], settings.braking)[::-1]
     acceleration, speed = 0.5 * np.diff(squares) / steps, np.sqrt(squares)
@@ -459,17 +451,6 @@ def speed_profile(
         acceleration = np.append(acceleration, 0.0)
     time = np.append(0.0, np.cumsum(seconds))
     return SpeedProfile(speed, acceleration, time[:count], float(time[-1]))
-
-
-def _check_ends(line: CentreLine | TrackAhead, begin: float | None, end: float | None) -> None:
-    limits, where = [limit for limit in (begin, end) if limit is not None], "a speed profile: expected"
-    if len(line.curvature) < 2:
-        raise SettingsError(f"{where} a line of at least 2 points, found {len(line.curvature)}")
-    if line.closed and limits:
-        raise SettingsError(f"{where} an open line for a begin or end speed, found a loop")
-    for limit in limits:
-        if not 0.0 <= limit < np.inf:
-            raise SettingsError(f"{where} a speed (m/s) of at least 0, found {limit:g}")
 
 
 def _accelerated(squares: Array, steps: Array, bend: Array, most: float) -> Array:

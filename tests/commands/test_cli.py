@@ -145,16 +145,6 @@ def test_the_result_is_printed_as_json_and_drawn(
     assert capsys.readouterr().out.splitlines()[0] == "x,y,label", "only the file is on standard output"
 
 
-def test_a_row_for_every_cycle(log_folder: Path, map_folder: Path) -> None:
-    log = read_log(log_folder)
-    rows = (map_folder / "cycles.csv").read_text().splitlines()
-    assert rows[0] == "cycle,t,seconds,size_left,size_right,readings,lap,offered,health,reason,dropped"
-    assert len(rows) == len(log.cycles) + 1
-    trajectory = np.loadtxt(map_folder / "trajectory.tum")
-    assert trajectory.shape == (len(log.cycles), 8)
-    np.testing.assert_array_equal(trajectory[:, 0], [cycle.t for cycle in log.cycles])
-
-
 def test_the_summary_says_how_and_how_well(map_folder: Path) -> None:
     summary = json.loads((map_folder / "summary.json").read_text())
     assert summary["estimator"] == "fixed-lag"

@@ -85,10 +85,10 @@ def test_on_another_track_the_map_of_its_own_road_is_written(
 def test_the_events_of_the_rules_are_known_by_name(event: object) -> None:
     track = event()  # type: ignore[operator]
     known = read_known_map(Path(track.name), 0.1, MapperSettings())
-    assert not known.map.closed
-    np.testing.assert_array_equal(known.start, track.start)
+    assert not known[0].closed
+    np.testing.assert_array_equal(known[1], track.start)
     for label, row in enumerate(track.rows):
-        boundary = known.map.boundaries[label]
+        boundary = known[0].boundaries[label]
         on_curve = boundary.spline.evaluate(boundary.cones[:, 0])  # type: ignore[union-attr]
         assert np.hypot(*(on_curve - row).T).max() < 0.2
         assert (np.diff(boundary.cones[:, 0]) > 0.0).all()  # type: ignore[union-attr]
@@ -98,9 +98,9 @@ def test_the_events_of_the_rules_are_known_by_name(event: object) -> None:
 def test_a_track_file_is_a_known_map() -> None:
     file = sorted(TRACKS.rglob("*.csv"))[0]
     known = read_known_map(file, 0.15, MapperSettings())
-    assert known.map.closed
-    assert known.start is None
-    left = known.map.boundaries[LEFT]
+    assert known[0].closed
+    assert known[1] is None
+    left = known[0].boundaries[LEFT]
     np.testing.assert_allclose(np.diag(left.covariance), 0.15**2)
 
 

@@ -49,13 +49,6 @@ def test_the_trajectory_is_copied_to_the_byte_over_an_earlier_file(tmp_path: Pat
     assert {path.name for path in tmp_path.iterdir()} == {"map", "out.tum"}
 
 
-def test_a_minus_is_standard_output(tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
-    source = folder(tmp_path / "map", ring_map())
-    assert main(["export", str(source), "--as", "tum", "--out", "-"]) == 0
-    assert capfdbinary.readouterr().out == (source / "trajectory.tum").read_bytes()
-    assert [path.name for path in tmp_path.iterdir()] == ["map"]
-
-
 @pytest.mark.parametrize("kind", ["centerline", "profile", "geojson", "lanelet2"])
 def test_no_way_is_exported_where_the_drive_crosses_a_boundary(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import gtsam
@@ -47,6 +48,16 @@ def test_where_there_is_no_graph_there_is_one_line(
     (line,) = capsys.readouterr().err.splitlines()
     assert GRAPH_FILE in line and "expected a factor graph" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_a_graph_that_gtsam_cannot_read_is_one_line_also_where_its_poses_can_be_read(
+    solved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = json.loads((solved / GRAPH_FILE).read_text())
+    (tmp_path / GRAPH_FILE).write_text(json.dumps(content | {"graph": "none"}))
+    assert main(["export", str(tmp_path), "--as", "g2o", "--out", str(tmp_path / "out")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "expected a factor graph" in line and not (tmp_path / "out").exists()
 
 
 def test_only_the_batch_of_one_log_has_a_graph(solved: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,7 +22,7 @@ from pathspace_graph.sim.simulate import PRESETS, SimulationSettings
 
 SCREEN = 50
 """Lines of a screen."""
-MOST_SETTINGS = 88
+MOST_SETTINGS = 55
 ONLINE = ["LOG", "--out", "MAP"]
 COMMAND = ["online", *ONLINE]
 

@@ -268,20 +268,6 @@ def test_a_slow_imu_gives_its_heading_all_the_same() -> None:
     assert twists[:-1, 2] @ np.diff(stamps) == pytest.approx(2.0)
 
 
-def test_poses_give_the_twists_that_lead_from_one_to_the_next(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def circle(messages: Messages, t: float) -> Any:
-        angle = TWIST[2] * t
-        x, y = 6.0 * np.sin(angle), 6.0 * (1.0 - np.cos(angle))
-        return messages.odometry(t, (0.0, 0.0, 0.0), (x, y, angle))
-
-    bag = written(tmp_path, circle)
-    assert "--from-poses makes the twists" in refused(bag, tmp_path / "log", capsys, *TOPICS)
-    log = convert(bag, tmp_path / "log", "--from-poses")
-    np.testing.assert_allclose(log.odometry.twist, np.tile([3.0, 0.0, 0.5], (10, 1)), atol=1e-5)
-
-
 # --- what real bags hold ---------------------------------------------------------------------------------
 
 

@@ -181,6 +181,12 @@ def test_of_parallel_markings_the_nearest_ones_bound_the_lane_in_all_their_dashe
     assert found.labels.tolist() == [LEFT] * 6 + [RIGHT] * 6
 
 
+def test_a_polyline_before_the_begin_of_the_path_has_no_side_and_is_kept() -> None:
+    vertices = Points.of([[-4.0, 1.7], [-2.0, 1.7]], np.full(2, UNKNOWN), lines=[0, 0])
+    found = lines_of(np.array([0.0]), vertices, AHEAD, Frames(), 1.0, Counter())
+    assert found.labels.tolist() == [UNKNOWN] * 3
+
+
 def test_a_scan_that_arrives_is_thinned_and_the_estimator_tells_its_sides(messages: Messages) -> None:
     stream = MessageStream()
     for t in (0.0, 0.1):
@@ -269,30 +275,6 @@ def test_json_lines_hold_polylines(tmp_path: Path) -> None:
     (tmp_path / "drive.jsonl").write_text('{"t": 0.0, "polylines": [{"label": "left"}]}')
     options = ["--from", "jsonl", "--out", str(tmp_path / "bad")]
     assert main(["convert", str(tmp_path / "drive.jsonl"), *options]) == 2
-
-
-@pytest.mark.parametrize(
-    "entry",
-    [
-        {"scan": {"ranges": [1.0]}},
-        {"scan": {"angle_min": 0.0, "angle_increment": "x", "ranges": [1.0]}},
-        {"scan": [1.0]},
-        {"polylines": [[[0.0, 1.0]]]},
-        {"polylines": [{"points": [[0.0, 1.0, 2.0]]}]},
-    ],
-)
-def test_a_wrong_line_is_named(
-    entry: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    lines = ['{"t": 0.0, "twist": [1.0, 0.0, 0.0]}', json.dumps({"t": 0.1, **entry})]
-    (tmp_path / "drive.jsonl").write_text("\n".join(lines))
-    source = str(tmp_path / "drive.jsonl")
-    assert main(["convert", source, "--from", "jsonl", "--out", str(tmp_path / "log")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert (
-        "row 2: expected a line with t, and with twist [vx, vy, wz], detections, polylines or a scan" in said
-    )
 
 
 def test_points_at_the_sensor_itself_have_a_spacing() -> None:

@@ -93,14 +93,6 @@ def test_range_and_bearing_take_the_place_of_x_and_y(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.cycles[0].points_vehicle, points * np.array([1, -1]), atol=1e-12)
 
 
-def test_rows_in_any_order_are_cycles_in_order_of_time(tmp_path: Path) -> None:
-    detections = "t,x,y,label\n0.3,3,0,left\n0.1,1,0,left\n0.3,3,1,left\n"
-    log = convert(write(tmp_path, "t,vx,wz\n1,1,0\n0,1,0\n", detections))
-    assert [cycle.t for cycle in log.cycles] == [0.1, 0.3]
-    np.testing.assert_array_equal(log.cycles[1].points_vehicle, [[3.0, 0.0], [3.0, 1.0]])
-    np.testing.assert_array_equal(log.odometry.t, [0.0, 1.0])
-
-
 # --- as other tools export it ----------------------------------------------------------------------------
 
 BEGIN = 1_714_557_600  # 2024-05-01 10:00:00 UTC, s since 1970
@@ -268,7 +260,21 @@ def test_json_lines_become_a_log(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "line",
-    ["{", "[]", '{"twist": [1, 2, 3]}', '{"t": 0, "twist": [1, 2]}', '{"t": 0, "detections": [{"x": 1}]}'],
+    [
+        *(
+            "{",
+            "[]",
+            '{"twist": [1, 2, 3]}',
+            '{"t": 0, "twist": [1, 2]}',
+            '{"t": 0, "detections": [{"x": 1}]}',
+        ),
+        '{"t": 0, "detections": [{"bearing": 0.1}]}',
+        '{"t": 0, "scan": {"ranges": [1.0]}}',
+        '{"t": 0, "scan": {"angle_min": 0.0, "angle_increment": "x", "ranges": [1.0]}}',
+        '{"t": 0, "scan": [1.0]}',
+        '{"t": 0, "polylines": [[[0.0, 1.0]]]}',
+        '{"t": 0, "polylines": [{"points": [[0.0, 1.0, 2.0]]}]}',
+    ],
 )
 def test_a_bad_line_is_named(line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "drive.jsonl").write_text(f"{LINES}{line}\n")
@@ -288,12 +294,3 @@ def test_a_line_with_one_cycle_has_no_rate(tmp_path: Path, capsys: pytest.Captur
     said = capsys.readouterr().out
     assert "odometry at an unknown rate, up to 1 m/s" in said
     assert "Hz" not in said
-
-
-def test_a_line_with_a_bearing_alone_names_the_range(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "drive.jsonl"
-    file.write_text('{"t": 1, "twist": [1, 0, 0], "detections": [{"bearing": 0.1}]}\n')
-    assert main(["convert", str(file), "--from", "jsonl", "--out", str(tmp_path / "log")]) == 2
-    assert "expected a cone with the fields x and y, range and bearing" in capsys.readouterr().err

@@ -50,10 +50,9 @@ from ..scenes.drives import ahead, bean_track, beginning, corridor, exact_log
 pytestmark = pytest.mark.usefixtures("png_only")
 
 SMALL: ScalingSettings = ScalingSettings(
-    cones_min=20.0,
-    cones_max=60.0,
+    cones_max=100.0,
     bins=4,
-    fit_from=20.0,
+    fit_from=50.0,
     readings=(2, 6, 12),
     readings_cones=60,
     warm_up=5,
@@ -75,9 +74,9 @@ def test_roads_have_their_gaps_and_width_and_never_come_near_themselves(track: A
 
 def test_the_long_drive_ends_when_the_last_cone_is_seen() -> None:
     ((log, at),) = sweep_drives(CONES, SMALL)
-    ((whole, _),) = sweep_drives(CONES, ScalingSettings(cones_min=20.0, cones_max=60.0, bins=1))
+    ((whole, _),) = sweep_drives(CONES, ScalingSettings(cones_max=100.0, bins=1))
     assert len(at) == len(log.cycles) == len(whole.cycles)
-    middles = 20.0 * (61.0 / 20.0) ** ((np.arange(4) + 0.5) / 4)  # of four intervals from 20 to 61 cones
+    middles = 50.0 * (101.0 / 50.0) ** ((np.arange(4) + 0.5) / 4)  # of four intervals from 50 to 101 cones
     np.testing.assert_allclose(np.unique(at[~np.isnan(at)]), middles)
     assert np.isnan(at[0]) and at[-1] == at[~np.isnan(at)].max()
 
@@ -209,8 +208,8 @@ def test_bad_requests_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "nobody" in capsys.readouterr().err
     assert cli.main(["scale", *out, "--quick", "--scaling.laps", "3"]) == cli.BAD_INPUT
     assert not (tmp_path / "new").exists()
-    with pytest.raises(SettingsError, match="cones_min"):
-        ScalingSettings(cones_min=300.0, cones_max=200.0)
+    with pytest.raises(SettingsError, match="cones_max: expected more than 50, found 50"):
+        ScalingSettings(cones_max=50.0)
 
 
 def test_a_short_run_gives_what_it_is_long_enough_for() -> None:

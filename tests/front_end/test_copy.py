@@ -8,10 +8,10 @@ import numpy as np
 
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
-from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.io.log import SIGMA_ODOMETRY, Detections, Odometry
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.mapper import ODOMETRY_SIGMA, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.digest import digest
 from ..scenes.drives import short_drive
@@ -46,7 +46,7 @@ def digests(front_end: FrontEnd) -> tuple[str, str]:
 
 def test_a_copy_stays_as_it_is_and_goes_on_as_the_original() -> None:
     cycles = drive()
-    noise = KnownNoise(np.array(ODOMETRY_SIGMA), odometry_stated=False, detections_stated=False)
+    noise = KnownNoise(np.array(SIGMA_ODOMETRY), odometry_stated=False, detections_stated=False)
     original, copies, readings = FrontEnd(MapperSettings(), noise), {}, []
     for k, cycle in enumerate(cycles):
         if k in COPIED_AT:

@@ -20,7 +20,7 @@ from pathspace_graph.front_end.gate import Admitted, Gate, Newest
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.plausibility.judge import read_usable_log
+from pathspace_graph.plausibility.judge import read_plausible_log
 from pathspace_graph.settings.online import LimitSettings
 
 from ..scenes.drives import ahead, corridor, exact_log
@@ -381,16 +381,16 @@ def test_refused_cycles_are_counted_until_one_is_used() -> None:
 def test_a_log_that_cannot_be_used_is_named_with_the_row_and_the_stamp(tmp_path: Path) -> None:
     log = exact_log(ahead(8.0, 2.0), *corridor(40.0))
     write_log(log, tmp_path / "good")
-    assert len(read_usable_log(tmp_path / "good", LIMITS).cycles) == len(log.cycles)
+    assert len(read_plausible_log(tmp_path / "good", LIMITS)[0].cycles) == len(log.cycles)
     twists = with_entry(log.odometry.twist, (37, 2), 1e3)
     write_log(replace(log, odometry=Odometry(log.odometry.t, twists)), tmp_path / "bad")
     with pytest.raises(InputError, match=r"odometry\.csv, row 39: cycle at 0\.8 s: .* found 1000"):
-        read_usable_log(tmp_path / "bad", LIMITS)
+        read_plausible_log(tmp_path / "bad", LIMITS)[0]
     late = tuple(replace(cycle, t=cycle.t + 100.0 * (cycle.t > 0.95)) for cycle in log.cycles)
     stamps = log.odometry.t + 100.0 * (log.odometry.t > 0.95)
     write_log(replace(log, cycles=late, odometry=Odometry(stamps, log.odometry.twist)), tmp_path / "gap")
     with pytest.raises(InputError, match=r"odometry\.csv, row 50: .* at most 30 s after"):
-        read_usable_log(tmp_path / "gap", LIMITS)
+        read_plausible_log(tmp_path / "gap", LIMITS)[0]
 
 
 def from_two_cameras(log: Log, seconds: float, resolution: float = 0.0) -> Log:
@@ -419,7 +419,7 @@ def test_messages_of_two_cameras_are_one_cycle_or_each_is_used_at_its_time(
 ) -> None:
     log = exact_log(ahead(8.0, 2.0), *corridor(40.0))
     write_log(from_two_cameras(log, seconds, resolution), tmp_path / "log")
-    read = read_usable_log(tmp_path / "log", LIMITS)
+    read = read_plausible_log(tmp_path / "log", LIMITS)[0]
     assert len(read.cycles) == of_each * (len(log.cycles) - 1)
     if of_each == 1:
         for cycle, exact in zip(read.cycles, log.cycles[:-1], strict=True):

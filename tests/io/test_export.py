@@ -27,7 +27,6 @@ from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.io.tables import read_table
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT
 from pathspace_graph.settings.output import SpeedSettings
-from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.spline.planning import speed_profile
 
 from ..scenes.maps import open_map, point_map, ring_map
@@ -51,14 +50,6 @@ def test_the_raceline_format(make: Callable[[], Map], tmp_path: Path) -> None:
     line = track.centre_line(0.7)
     rows = np.loadtxt(file, comments="#", delimiter=",")  # as TUM's own tools read it
     assert np.array_equal(rows, np.column_stack([line.points, line.width_right, line.width_left]))
-
-
-def test_a_raceline_is_a_track_of_the_simulator(tmp_path: Path) -> None:
-    file = tmp_path / "line.csv"
-    write_centre_line(file, ring_map(), 1.0)
-    track = read_track(file)
-    assert np.hypot(*track.left.T) == pytest.approx(18.0, abs=2e-3)
-    assert np.hypot(*track.right.T) == pytest.approx(22.0, abs=2e-3)
 
 
 @every_map
@@ -145,15 +136,6 @@ def test_geojson(make: Callable[[], Map], tmp_path: Path) -> None:
     assert properties["width_left_m"] == line.width_left.tolist()
     assert properties["across_sigma_m"] == line.points_sigma.tolist()
     assert properties["length_m"] == line.length
-
-
-def test_landmarks_are_multi_points_in_geojson(tmp_path: Path) -> None:
-    file = tmp_path / "map.geojson"
-    write_geojson(file, point_map(), 1.0, PLANE)
-    features = json.loads(file.read_text())["features"]
-    assert [feature["geometry"]["type"] for feature in features] == ["MultiPoint", "MultiPoint"]
-    there = to_map(PLANE, np.array(features[0]["geometry"]["coordinates"])[:, ::-1])
-    assert there == pytest.approx(np.array([[0.0, 2.0], [4.0, 2.5]]), abs=2e-5)
 
 
 @every_map

@@ -111,14 +111,6 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_minimal_log(folder: Path) -> None:
-    log = read_log(folder)
-    assert log.truth is None
-    assert log.sensor == SensorInfo()
-    assert [cycle.t for cycle in log.cycles] == [0.0, 0.1]
-    assert [cycle.labels.tolist() for cycle in log.cycles] == [[LEFT], [RIGHT]]
-
-
 def test_columns_may_be_in_any_order_with_more_of_them_and_in_any_dress(folder: Path) -> None:
     text = 'label,extra, yy ,xy,xx,y,x,t\r\n"blue",?,0.1,0,0.2, 1 ,"3",0\r\nYellow,,0.1,0,0.2,-1,3,0\r\n\r\n'
     text += "cone?,,0.1,0,0.2,-1,3,0.1\r\n"
@@ -127,11 +119,6 @@ def test_columns_may_be_in_any_order_with_more_of_them_and_in_any_dress(folder: 
     assert [cycle.labels.tolist() for cycle in log.cycles] == [[LEFT, RIGHT], [UNKNOWN]]
     np.testing.assert_array_equal(log.cycles[0].points_vehicle, [[3, 1], [3, -1]])
     np.testing.assert_array_equal(log.cycles[0].covariances[0], [[0.2, 0], [0, 0.1]])
-
-
-def test_no_detections_is_a_log_without_cycles(folder: Path) -> None:
-    (folder / "detections.csv").write_text("t,x,y,label,xx,xy,yy\n")
-    assert read_log(folder).cycles == ()
 
 
 @pytest.mark.parametrize("name", ["log.toml", "odometry.csv", "detections.csv"])

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline as ScipyBSpline
 
-from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.errors import InputError
 from pathspace_graph.io.files import write_json
 from pathspace_graph.io.map import (
     MAP_FILE,
@@ -30,7 +30,7 @@ from pathspace_graph.labels import BOUNDARIES, LEFT, ORANGE, RIGHT
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import fit_spline
 
-from ..scenes.maps import SIGMA, open_map, point_map, ring_map
+from ..scenes.maps import SIGMA, open_map, ring_map
 
 
 def covariance(size: int, seed: int) -> np.ndarray:
@@ -305,9 +305,3 @@ def test_an_outline_has_no_covariance() -> None:
     bare = {label: replace(curve_of(ring_map(), label), covariance=np.zeros((0, 0))) for label in BOUNDARIES}
     track = as_ribbon(Map(True, bare), SIGMA)
     assert track.joint_covariance is None and curve_of(track, RIGHT).covariance.shape == (0, 0)
-
-
-def test_landmarks_and_one_boundary_alone_have_no_ribbon() -> None:
-    for track in (point_map(), Map(True, {LEFT: curve_of(ring_map(), LEFT)})):
-        with pytest.raises(SettingsError, match="a centre line: expected a curve as"):
-            as_ribbon(track, SIGMA)

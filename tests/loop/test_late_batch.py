@@ -27,7 +27,7 @@ from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import worker
 from pathspace_graph.loop.lap_solver import LONGEST_WAIT
 from pathspace_graph.loop.map_repair import REPAIRED
-from pathspace_graph.loop.open import STAYS_OPEN, ReturnFinder, Revisits
+from pathspace_graph.loop.open import RETRY, STAYS_OPEN, ReturnFinder, Revisits
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -219,7 +219,8 @@ def test_a_batch_that_never_ends_is_given_up_and_the_window_is_the_lag_again(
     ended: list[bool] = []
     monkeypatch.setattr(worker, "_end_worker", lambda: ended.append(True))
     monkeypatch.setattr("pathspace_graph.loop.lap_solver.MOST_LATE", 12)
-    mapper = with_settings(retry=1e3)  # the next one would be sent at once
+    monkeypatch.setattr("pathspace_graph.loop.open.RETRY", 1e3)  # the next one would be sent at once
+    mapper = with_settings()
     results = drive(mapper, sent, NEVER, log())
     end = due_cycle(sent[0]) + 13
     notices = {k: result.notice for k, result in enumerate(results) if result.notice}
@@ -228,7 +229,7 @@ def test_a_batch_that_never_ends_is_given_up_and_the_window_is_the_lag_again(
     assert mapper.batches().ends == (end,)
     assert ended == [True]
     assert len(mapper.poses) == 31
-    replayed = with_settings(retry=1e3, ends=(end,))
+    replayed = with_settings(ends=(end,))
     run_online(log(), replayed)  # waits for nothing, since the batch ends in no cycle
     assert_same(replayed, mapper)
 
@@ -408,7 +409,7 @@ def test_a_loop_stays_open_until_a_batch_agrees(
     assert [result.closed for result in results].index(True) == jumps[0] > notices[0]
     assert len(sent) == 2 and mapper.failures == 0
     between = sent[1].lap.chain.dead_reckoned(np.zeros(2))[len(sent[0].lap.chain) - 1 :]
-    assert path_lengths(between)[-1] >= mapper.settings.open_lap.retry
+    assert path_lengths(between)[-1] >= RETRY
 
 
 def test_nothing_changes_before_a_batch_agrees(

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 NOTHING = np.zeros(0)  # a sensor without errors
 
-SETTINGS = GrowthSettings(sightings=3, merge_radius=1.0, forget_after=6.0)
+SETTINGS = GrowthSettings(sightings=3, merge_radius=1.0)
 
 CONES = np.array([[5.0, 1.0], [5.0, -1.0], [8.0, 0.0]])
 LABELS = np.array([BIG_ORANGE, BIG_ORANGE, ORANGE])

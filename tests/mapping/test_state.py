@@ -127,7 +127,7 @@ def test_a_foot_point_before_the_active_stretch_is_noticed(state: State) -> None
 
 def test_the_extrapolated_end_is_no_part_of_a_stretch(state: State) -> None:
     trusted = state.boundaries[RIGHT].trusted
-    assert trusted == 40.0 + SplineSettings().confirmed_margin
+    assert trusted == 40.5
     points, curve, low = np.array([[20.0, -2.0], [99.0, -2.0]]), np.array([1, 1]), np.zeros(2)
     foot = state.curves.find(state.map_points, points, curve, low, np.array([20.0, 99.0]))
     np.testing.assert_allclose(foot.u, [20.0, trusted], atol=1e-9)

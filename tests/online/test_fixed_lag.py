@@ -456,8 +456,8 @@ def test_looking_at_the_map_changes_nothing() -> None:
 
 
 def test_a_setting_out_of_range_is_named() -> None:
-    with pytest.raises(SettingsError, match=r"growth\.reach: expected a positive number, found -1"):
-        GrowthSettings(reach=-1.0)
+    with pytest.raises(SettingsError, match=r"growth\.merge_radius: expected a positive number, found -1"):
+        GrowthSettings(merge_radius=-1.0)
     with pytest.raises(SettingsError, match=r"^lag: expected a positive number, found nan"):
         MapperSettings(lag=float("nan"))
 

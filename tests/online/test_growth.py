@@ -331,19 +331,18 @@ def test_an_end_led_on_in_the_wrong_order_is_taken_back(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize(
-    ("size", "constants"),
-    [(10.0, {}), (5000.0, {"LENGTH_DRIVEN": 0.01, "LENGTH_FREE": 25.0})],
+    "constants",
+    [{"MAX_SIZE": 10}, {"LENGTH_DRIVEN": 0.01, "LENGTH_FREE": 25.0}],
     ids=["size", "length"],
 )
 def test_an_open_curve_has_a_bound_and_it_is_said_once_for_each_boundary(
-    size: float, constants: dict[str, float], monkeypatch: pytest.MonkeyPatch
+    constants: dict[str, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in constants.items():
         monkeypatch.setattr(growth, name, value)
-    bound = GrowthSettings(max_size=size)
     cones, labels = corridor(100.0)
     log = exact_log(ahead(6.0, 12.0), cones, labels)
-    mapper, results = map_log(log, FixedLagMapper(replace(MapperSettings(), growth=bound)))
+    mapper, results = map_log(log, FixedLagMapper())
     notices = sorted("; ".join(result.notice for result in results if result.notice).split("; "))
     assert [notice.split(" boundary ")[0] for notice in notices] == ["the open left", "the open right"]
     assert all("grows no further, with" in notice for notice in notices)

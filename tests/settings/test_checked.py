@@ -19,8 +19,6 @@ from pathspace_graph.sim.sensor import OdometryNoise
 
 UNLIMITED = {
     "gate.huber",
-    "growth.forget_after",
-    "growth.max_size",
     "odometry.doubt",
     "motion.doubt",
     "calibration.doubt",
@@ -71,7 +69,6 @@ def test_every_number_but_a_known_error_is_positive_and_most_are_finite(
 def test_infinity_means_no_limit_where_a_limit_is_set() -> None:
     settings = MapperSettings()
     assert replace(settings.gate, huber=inf).huber == inf
-    assert replace(settings.growth, forget_after=inf).forget_after == inf
 
 
 @pytest.mark.parametrize(

@@ -101,14 +101,6 @@ def test_growth_reaches_for_the_cones_and_keeps_what_was_confirmed(steps: list[t
         assert np.hypot(*(boundary.evaluate(points, u[k : k + 1])[0] - cones[k])) < 1.1
 
 
-def test_a_straight_stays_straight_and_evenly_spaced() -> None:
-    boundary, points = line(24.0)
-    np.testing.assert_allclose(points[:, 1], 0.0, atol=1e-9)
-    np.testing.assert_allclose(np.diff(points[:, 0]), SPLINE.spacing, atol=1e-6)
-    u = np.linspace(0.0, 24.0, 50)
-    np.testing.assert_allclose(boundary.evaluate(points, u)[:, 0], u, atol=1e-6)
-
-
 def test_taking_back_leaves_the_first_cones() -> None:
     boundary, _ = line(24.0)
     boundary.take_back(4)

@@ -7,7 +7,7 @@ import pytest
 
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.spline.boundary import at_level_crossing, boundaries_cross, polyline_crossings, sampled
+from pathspace_graph.spline.boundary import boundaries_cross, polyline_crossings, sampled
 from pathspace_graph.spline.bspline import BSpline
 
 STEP = 0.25
@@ -62,9 +62,6 @@ def test_boundaries_cross_at_a_level_crossing_of_their_road_and_that_is_no_fault
     twice = np.concatenate([driven, driven + 0.3])
     assert not boundaries_cross(both, STEP, twice)
     assert boundaries_cross({LEFT: left, RIGHT: ring(13.0, 40.0)}, STEP, driven)  # far from the crossing
-    np.testing.assert_array_equal(
-        at_level_crossing(np.array([[3.0, 1.0], [40.0, 0.0]]), driven), [True, False]
-    )
 
 
 def test_samples_lie_on_the_curve_and_are_a_step_apart() -> None:

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import yaml
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.settings.mapper import SplineSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.knots import SAMPLED_WEIGHT, LeastSquares, fit_spline
-
-from ..scenes.paths import TRACKS
 
 
 def ring(m: int, seed: int = 0) -> BSpline:
@@ -90,20 +86,7 @@ def test_a_fit_to_few_points_does_not_blow_up(count: int, size: int) -> None:
 
 
 def test_settings_out_of_range_are_refused() -> None:
-    with pytest.raises(SettingsError, match="baseline"):
-        SplineSettings(linear_baseline=1.5)
     with pytest.raises(SettingsError, match="too few"):
         fit_spline(np.eye(5)[:, :2], 3, periodic=True)
     with pytest.raises(SettingsError, match="distinct points"):
         fit_spline(np.zeros((5, 2)), 5, periodic=False)
-
-
-@pytest.mark.skipif(not TRACKS.is_dir(), reason="needs the real tracks beside the repository")
-def test_44_percent_of_the_cones_hold_a_real_track() -> None:
-    for file in sorted((TRACKS / "pacsim").glob("*.yaml"))[:3]:
-        track = yaml.safe_load(file.read_text())["track"]
-        for side in ("left", "right"):
-            cones = np.array([cone["position"][:2] for cone in track[side]], dtype=np.float64)
-            fitted, _ = fit_spline(cones, round(0.44 * len(cones)), periodic=True)
-            distance = fitted.foot_points(cones).distance
-            assert np.sqrt(np.mean(distance**2)) < 0.25

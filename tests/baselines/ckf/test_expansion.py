@@ -14,7 +14,7 @@ from pathspace_graph.baselines.ckf_curves import CurveState, Expansion, beyond_e
 from pathspace_graph.baselines.filters import FILTER_REACH
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.path import CARRIED_TO, DrivenPath, PathAhead
-from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings
 
 from .scenes import detections_of, straight_rows
 
@@ -64,7 +64,7 @@ def test_the_papers_three_conditions_by_hand() -> None:
     """The points are beyond the end, beside the curve, nearer than the threshold, and near `C_{n-1}`."""
     control_points = np.array([[0.0, 0.0], [4.0, 8.0], [8.0, 0.0]])
     points, u = np.array([[13.0, 0.0], [13.0, 0.0], [11.0, 0.0], [4.0, 5.0]]), np.array([9.0, 8.0, 9.0, 9.0])
-    found = beyond_end(points, u, 9.0, control_points, CkfSettings(threshold=4.0, separation=4.0))
+    found = beyond_end(points, u, 9.0, control_points, 4.0, 4.0)
     np.testing.assert_array_equal(found, [True, False, False, False])
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from pathspace_graph.baselines import ckf_curves
 from pathspace_graph.baselines.ckf_belief import to_vehicle_rows
-from pathspace_graph.baselines.ckf_curves import classify, on_curve, update
+from pathspace_graph.baselines.ckf_curves import RIDGE, SIGMA_ALONG, classify, on_curve, update
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.settings.mapper import CkfSettings
 
 from .scenes import COVARIANCE, bend, detections_of, straight_rows
 
@@ -68,7 +69,7 @@ def test_the_update_is_the_kalman_filter_on_the_detections() -> None:
     H = np.kron(on.basis, np.eye(2))
     R = np.zeros((6, 6))
     for i, tangent in enumerate(on.tangents):
-        along = settings.sigma_along**2 * np.outer(tangent, tangent)
+        along = SIGMA_ALONG**2 * np.outer(tangent, tangent)
         R[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = COVARIANCE + settings.sigma_model**2 * np.eye(2) + along
     mean, covariance = state.control_points(LEFT).ravel().copy(), state.covariance(LEFT)
     gain = covariance @ H.T @ np.linalg.inv(H @ covariance @ H.T + R)
@@ -78,11 +79,12 @@ def test_the_update_is_the_kalman_filter_on_the_detections() -> None:
     np.testing.assert_allclose(state.covariance(LEFT), covariance - gain @ H @ covariance, atol=1e-6)
 
 
-def test_the_ridge_makes_no_difference_to_the_update() -> None:
+def test_the_ridge_makes_no_difference_to_the_update(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both sides of the innovation go through one full-rank gain, which cancels."""
     results = []
-    for ridge in (CkfSettings().ridge, 2.0):
-        state = bend(CkfSettings(ridge=ridge))
+    for ridge in (RIDGE, 2.0):
+        monkeypatch.setattr(ckf_curves, "RIDGE", ridge)
+        state = bend()
         detections = detections_of(POINTS)
         update(state, detections, classify(state, detections))
         results.append((state.belief.mean, state.belief.covariance))

@@ -15,11 +15,8 @@ from pathspace_graph.io.results import RunResult
 from pathspace_graph.labels import ORANGE
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import ObservedCycle, run_online
-from pathspace_graph.settings.output import RecordingSettings
 
 from ...scenes.drives import noisy_lap
-
-BAND_EVERY = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +40,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Watched:
     cycles: list[ObservedCycle] = []
     window: list[int] = []
     rrd = folder / "run.rrd"
-    settings = RecordingSettings(band_every=BAND_EVERY)
-    with recording(rrd, settings=settings, truth=log.truth) as recorder:
+    with recording(rrd, truth=log.truth) as recorder:
         mapper = FixedLagMapper(odometry_sigma=log.odometry_sigma)
         look = [recorder, cycles.append, lambda cycle: window.append(len(cycle.window))]
         watched = run_online(log, mapper, observers=look)

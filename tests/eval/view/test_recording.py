@@ -17,6 +17,7 @@ from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.view import recording as entities
 from pathspace_graph.eval.view import recording as module
 from pathspace_graph.eval.view.recording import (
+    BAND_EVERY,
     DISPLAYS,
     check_recording,
     dashes,
@@ -29,7 +30,7 @@ from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ...scenes.drives import ahead, corridor, exact_log
-from .conftest import BAND_EVERY, OrangeMapper, Watched
+from .conftest import OrangeMapper, Watched
 
 Rows = dict[str, dict[int, dict[str, Any]]]
 
