@@ -19,12 +19,11 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
 from .log_odometry import LogOdometry, chained
-from .measurement import odometry_noise
 from .motion import MotionCheck
 from .noise import NoiseLearner, measure_noise
 from .scan_matching import merged
 from .sides import SideJudge
-from .sightings import SeenCycle, TwistRecord
+from .sightings import SeenCycle, TwistRecord, dead_reckoned
 
 SWAPPED: Final = {  # notices of the cycle in which colours become swapped, or no longer are
     True: "the cones on the left have the colour of the right boundary: the colours are swapped, the track "
@@ -73,7 +72,7 @@ class FrontEnd(Copyable):
         noise, check, sides = self.noise, self._motion, self._sides
         cones, orange, in_lane = split_detections(detections, self._settings)
         checked = noise.for_check(cones, odometry.twist[-1] if len(odometry.t) else np.zeros(3))
-        motion = check.update(odometry, checked, "contradict" if noise.is_settled else "agree")
+        motion = check.update(odometry, checked, may_contradict=noise.is_settled)
         swapped, colourless = sides.swapped, sides.colourless
         labels = sides.update(check.pose, motion.twists, checked, in_lane=in_lane).labels
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
@@ -165,16 +164,12 @@ def measure_log(log: Log, settings: MapperSettings | None = None) -> MeasuredNoi
 def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[SeenCycle], TwistRecord]:
     """Return the detections of a log with poses by odometry alone, and its twists; odometry is trusted."""
     settings = settings or MapperSettings()
-    readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
-    for odometry, _ in readings:
-        twists.add(odometry)
-    white = odometry_noise(twists, None)
-    noise = log.noise.twist if white is None else white.twist
-    check = MotionCheck(noise, settings.motion, of_lines=settings.of_lines)
-    sides = SideJudge(settings.sides)
-    for odometry, detections in readings:
+    twists, sides, cycles = TwistRecord(), SideJudge(settings.sides), []
+    twists.add(log.odometry)
+    poses = dead_reckoned(log.odometry, np.array([cycle.t for cycle in log.cycles]))
+    for pose, (odometry, detections) in zip(poses, split_odometry(log), strict=True):
         cones, _, in_lane = split_detections(detections, settings)
-        motion = check.update(odometry, cones, "bridge")
-        labelled = sides.update(check.pose, motion.twists, cones, in_lane=in_lane)
-        cycles.append(SeenCycle(labelled, check.pose, motion.odometry.twist))
+        labelled = sides.update(pose, odometry.twist, cones, in_lane=in_lane)
+        twist = odometry.twist[-1] if len(odometry.t) else np.zeros(3)
+        cycles.append(SeenCycle(labelled, pose, twist))
     return cycles, twists

@@ -10,7 +10,7 @@ import numpy as np
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
-from pathspace_graph.factors.se2 import left_of, rotated, to_map
+from pathspace_graph.factors.se2 import compose, left_of, rotated, se2_exp, to_map
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.tracks import Tracks
 
@@ -71,6 +71,13 @@ class Sightings:
         points = to_map(noise.corrected(self.point, self.twist), self.pose)
         cones = Tracks(GATE_LEAST, most=GATE_MOST / GATE_LEAST, sigmas=GATE_SIGMAS)
         return replace(self, cone=cones.add(points, rotated(covariances, self.pose[:, 2]), self.cone, self.t))
+
+
+def dead_reckoned(odometry: Odometry, stamps: Array) -> Array:
+    """Poses (n, 3) at stamps (n,) in s by odometry alone, from the origin at its first row."""
+    row = np.maximum(odometry.t.searchsorted(stamps, side="right") - 1, 0)
+    held = np.maximum(stamps - odometry.t[row], 0.0)
+    return compose(odometry.poses()[row], se2_exp(odometry.twist[row] * held[:, None]))
 
 
 class TwistRecord(Copyable):

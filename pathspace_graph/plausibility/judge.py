@@ -27,7 +27,7 @@ from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.gate import TWIST, check_usable
 from pathspace_graph.front_end.measurement import LEAST_NOISE
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
-from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_MOST, TwistRecord
+from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_MOST, TwistRecord, dead_reckoned
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, covariances_of
 from pathspace_graph.io.log_files import read_log
@@ -36,7 +36,7 @@ from pathspace_graph.io.tables import read_table
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.settings.online import LimitSettings
 
-from .regression import Better, Complex, Fit, Regression, dead_reckoned, far_better, motions_of
+from .regression import Better, Complex, Fit, Regression, far_better, motions_of
 
 SURVIVABLE: Final = {"gaps", "reach", "mounting", "covariances", "labels", "noise", "sides"}
 """Causes in spite of which a map can be right."""

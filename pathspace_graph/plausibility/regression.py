@@ -30,6 +30,7 @@ from pathspace_graph.front_end.scan_matching import (
     SCAN_HUBER,
     SIGMA_CONE,
 )
+from pathspace_graph.front_end.sightings import dead_reckoned
 from pathspace_graph.io.log import Detections, Log, Odometry
 
 Complex = NDArray[np.complex128]
@@ -93,11 +94,6 @@ def motions_of(
     table = np.array(sorted(rows, key=lambda row: row[0] + row[1])).reshape(-1, 14)
     begin, end, vx, vy, rate = table[:, :5].T
     return Motions(begin, end, vx + 1j * vy, rate, table[:, 5:].reshape(-1, 3, 3), tried)
-
-
-def dead_reckoned(odometry: Odometry, stamps: Array) -> Array:
-    """Poses (n, 3) at stamps (n,) in s, by the odometry alone."""
-    return np.column_stack([np.interp(stamps, odometry.t, column) for column in odometry.poses().T])
 
 
 def register(

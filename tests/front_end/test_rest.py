@@ -12,7 +12,7 @@ from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import half_square, mean_bias
-from pathspace_graph.front_end.motion import MotionCheck, Rest
+from pathspace_graph.front_end.motion import MotionCheck, Standstill
 from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement
@@ -117,12 +117,12 @@ def test_the_motion_in_which_a_rest_ends_may_have_missed_the_start(log: Log) -> 
 
 
 def test_a_vehicle_that_creeps_is_not_at_rest() -> None:
-    rest, rng = Rest(), np.random.default_rng(0)
+    rest, rng = Standstill(), np.random.default_rng(0)
     told = []
     for k in range(40):
         t = 0.1 * k + 0.02 * np.arange(5)
         twist = np.array([0.3, 0.0, 0.0]) + SIGMA * rng.standard_normal((5, 3))
-        told.append(rest.update(Odometry(t, twist), 0.1 * (k + 1), TwistNoise(SIGMA)))
+        told.append(rest.by_twists(Odometry(t, twist), 0.1 * (k + 1), TwistNoise(SIGMA)))
     assert not any(told[12:])
 
 

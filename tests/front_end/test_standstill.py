@@ -221,8 +221,8 @@ def test_three_cycles_count_as_two_thirds_of_their_three_pairs() -> None:
     far = np.array([[30.0, 0.0]])  # so that the others are in view
     points, step = np.concatenate([PLACES, far]), np.array([1.3, 0.0, 0.0])
     twice = 2.0 / 3.0 * 3.0 * 10.0 * GAIN
-    assert stands(points, 3, step).place(np.sqrt(0.98 * twice)) is not None
-    assert stands(points, 3, step).place(np.sqrt(1.02 * twice)) is None
+    assert stands(points, 3, step).by_cones(np.sqrt(0.98 * twice)) is not None
+    assert stands(points, 3, step).by_cones(np.sqrt(1.02 * twice)) is None
 
 
 def test_only_what_the_other_cycle_could_see_says_that_the_vehicle_stands() -> None:
@@ -231,7 +231,7 @@ def test_only_what_the_other_cycle_could_see_says_that_the_vehicle_stands() -> N
     once, twice = ((ranges <= ranges.max() - k * 1.3).sum() for k in (1, 2))
     assert 10 > once > twice > 0
     likelier = 2.0 / 3.0 * (2 * once + twice) * GAIN
-    assert stands(PLACES, 3, step).place(np.sqrt(1.02 * likelier)) is None
+    assert stands(PLACES, 3, step).by_cones(np.sqrt(1.02 * likelier)) is None
 
 
 def test_an_odometry_that_is_always_believed_is_believed_here() -> None:
@@ -249,4 +249,4 @@ def test_wheels_that_turn_faster_than_a_creep_are_not_compared_with_earlier_cycl
     for k in range(11):
         delta = np.array([PERIOD * speed if k == 10 else 0.0, 0.0, 0.0])
         standstill.add(PERIOD * k, points, covariances, delta)
-    assert (standstill.place(1.0) is not None) is stands
+    assert (standstill.by_cones(1.0) is not None) is stands
