@@ -15,8 +15,8 @@ from pathspace_graph.convert.text_files import read_csv, read_json_lines
 from pathspace_graph.errors import InputError, PathspaceError, SettingsError
 from pathspace_graph.front_end.front_end import seen_cycles
 from pathspace_graph.front_end.gate import check_usable
+from pathspace_graph.front_end.measurement import TwistRecord
 from pathspace_graph.front_end.noise import measure_noise
-from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import LOG_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.io.log_files import write_log

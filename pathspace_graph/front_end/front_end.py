@@ -19,11 +19,11 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
 from .log_odometry import LogOdometry, chained
+from .measurement import SeenCycle, TwistRecord, dead_reckoned
 from .motion import MotionCheck
 from .noise import NoiseLearner, measure_noise
 from .scan_matching import merged
 from .sides import SideJudge
-from .sightings import SeenCycle, TwistRecord, dead_reckoned
 
 SWAPPED: Final = {  # notices of the cycle in which colours become swapped, or no longer are
     True: "the cones on the left have the colour of the right boundary: the colours are swapped, the track "

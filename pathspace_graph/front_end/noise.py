@@ -10,7 +10,7 @@ import numpy as np
 
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
-from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, TwistNoise
+from pathspace_graph.factors.noise import ASSUMED_DRIFT, KnownNoise, MeasuredNoise, TwistNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import NoiseSource, RunNoise
@@ -18,8 +18,7 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .line_noise import LineMeasurement
-from .measurement import Measurement, odometry_noise
-from .sightings import SeenCycle, TwistRecord
+from .measurement import Measurement, SeenCycle, TwistRecord
 
 FIRST: Final = 8.0  # driving time before the first measurement of noise (s)
 AGAIN: Final = 1.5  # growth of the driving time between measurements
@@ -221,8 +220,13 @@ def begun(
     cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None, *, of_lines: bool
 ) -> Measurement | LineMeasurement | None:
     """Start a measurement on cones or on lines; None if not even the odometry's noise can be estimated."""
-    found = odometry_noise(twists, known)
-    return None if found is None else (LineMeasurement if of_lines else Measurement)(cycles, found)
+    white = twists.white()
+    if white is None:
+        return None
+    sigma, interval = white
+    found = known or MeasuredNoise(sigma, np.array(ASSUMED_DRIFT), interval)
+    found = replace(found, odometry=sigma, interval=interval)
+    return (LineMeasurement if of_lines else Measurement)(cycles, found)
 
 
 def measure_noise(

@@ -25,9 +25,14 @@ from pathspace_graph.factors.noise import ASSUMED_DRIFT, ray_sigmas
 from pathspace_graph.factors.se2 import move_points, relative
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.gate import TWIST, check_usable
-from pathspace_graph.front_end.measurement import LEAST_NOISE
+from pathspace_graph.front_end.measurement import (
+    FOLLOW_RANGE,
+    GATE_MOST,
+    LEAST_NOISE,
+    TwistRecord,
+    dead_reckoned,
+)
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
-from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_MOST, TwistRecord, dead_reckoned
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, covariances_of
 from pathspace_graph.io.log_files import read_log

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import relative
+from pathspace_graph.front_end.measurement import dead_reckoned
 from pathspace_graph.front_end.scan_matching import (
     FARTHEST,
     LEAST_SHARE,
@@ -30,7 +31,6 @@ from pathspace_graph.front_end.scan_matching import (
     SCAN_HUBER,
     SIGMA_CONE,
 )
-from pathspace_graph.front_end.sightings import dead_reckoned
 from pathspace_graph.io.log import Detections, Log, Odometry
 
 Complex = NDArray[np.complex128]

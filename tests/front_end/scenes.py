@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
+from pathspace_graph.front_end.measurement import SeenCycle, TwistRecord
 from pathspace_graph.front_end.noise import measure_noise
-from pathspace_graph.front_end.sightings import SeenCycle, TwistRecord
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.sim.vehicle import integrate

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.front_end.cone_rows import ROW_GAP, ConeRow, extend_rows
+from pathspace_graph.front_end.sides import ROW_GAP, ConeRow, extend_rows
 from pathspace_graph.mapping.path import crosses
 
 Array = NDArray[np.float64]

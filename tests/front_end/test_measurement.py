@@ -24,9 +24,9 @@ from pathspace_graph.front_end.measurement import (
     PRIOR,
     ROUNDS_AGAIN,
     ROUNDS_FIRST,
+    TwistRecord,
 )
 from pathspace_graph.front_end.noise import begun, measure_noise
-from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.log import Log
 from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track_generator import generate_track

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
-from pathspace_graph.front_end.sightings import (
+from pathspace_graph.front_end.measurement import (
     FOLLOW_RANGE,
     MIN_TWISTS,
     MOST_PARTS,

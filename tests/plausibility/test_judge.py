@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
-from pathspace_graph.front_end.sightings import TwistRecord
+from pathspace_graph.front_end.measurement import TwistRecord
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.io.overrides import override
 from pathspace_graph.labels import KINDS, LEFT, RIGHT, UNKNOWN, Kind
