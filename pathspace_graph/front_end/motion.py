@@ -17,10 +17,7 @@ from pathspace_graph.settings.online import MotionSettings
 
 from .gate import Newest
 from .scan_matching import (
-    MAX_MISFIT,
     MIN_DOUBTING,
-    MISFIT_ODOMETRY,
-    MISFIT_RATIO,
     MOST_MISFIT,
     REACHES,
     REACHES_CHECK,
@@ -152,7 +149,6 @@ WIDENED: Final = 1.5  # inflation of the sigmas of a matched motion: the estimat
 HOLD: Final = (0.15, 3.0)
 """Time (s) for which a twist is held without additional noise, or multiple of the shortest interval between
 twists, if that is longer."""
-STUCK: Final = 3  # number of twists equal to the previous one from which readings are stuck
 STANDING: Final = MeasuredMotion(
     integrated_odometry(np.zeros(3), np.diag([5e-4, 5e-4, 5e-5]) ** 2, np.zeros((3, 2))), np.zeros((1, 3))
 )
@@ -276,7 +272,8 @@ class MotionCheck(Copyable):
         )
         self._twist, self._twist_t = twists[-1], float(stamps[-1]) if len(stamps) > 1 else first
         integrated = integrate_twists(durations, twists, np.hypot(self.noise.sigmas(durations), excess))
-        return MeasuredMotion(integrated, twists, False, missing, same >= STUCK, None, durations, excess)
+        stuck = same >= 3  # number of twists equal to the previous one
+        return MeasuredMotion(integrated, twists, False, missing, stuck, None, durations, excess)
 
     def _likeliest(
         self, motion: MeasuredMotion, t: float, seen: Seen, rests: bool, may_contradict: bool
@@ -293,7 +290,8 @@ class MotionCheck(Copyable):
             return motion, None
         limit = GATE_DISTRUSTED if t - self._doubted_at < DISTRUST else self._settings.doubt
         matcher, odometry, dt = self._matcher, motion.odometry, t - self._t
-        sigmas, largest = np.array(SIGMAS_CHANGE) * dt, MAX_MISFIT * matcher.excess
+        sigmas = np.array(SIGMAS_CHANGE) * dt
+        largest = 3.0 * matcher.excess  # misfits are 1 where the vehicle moved, 4 where it was put down
         going_on = dt * (odometry.twist if self._velocity is None else self._velocity)
         jumped = bool((np.abs(odometry.delta - going_on) > sigmas).any())
         for one in [STANDING, motion] if rests else [motion]:
@@ -324,7 +322,7 @@ class MotionCheck(Copyable):
             if not failed:
                 matched = Seen(seen.points[best.is_matched], seen.variances[best.is_matched])
                 at_odometry, at_match = (matcher.misfit(matched, pose) for pose in (predicted, best.pose))
-                fits_better = at_odometry > max(MISFIT_ODOMETRY, MISFIT_RATIO * at_match)
+                fits_better = at_odometry > max(2.0, 1.3 * at_match)
                 if difference.square <= limit**2 or not fits_better:
                     return motion, None
             mean = going_on.copy()
