@@ -35,7 +35,9 @@ CREEP: Final = 3.0  # largest speed of creep (m/s); a single cycle contradicts s
 HYPOTHESES: Final = (0.0, 0.25, 0.5, 1.0)
 """Hypotheses, as shares of the odometry's motion: standstill, slip, and the odometry itself."""
 CHANCE: Final = 4.5  # least gain (sigmas of its scatter): points of a line fit by chance below
-REST_TWIST: Final = (0.1, 0.1, 0.05)  # largest mean twist at rest (m/s, m/s, rad/s), without its noise
+REST_TWIST: Final = np.array(
+    [0.1, 0.1, 0.05]
+)  # largest mean twist at rest (m/s, m/s, rad/s), without its noise
 REST_SIGMAS: Final = 3.0  # allowance for the noise of the mean (sigmas)
 
 
@@ -62,23 +64,21 @@ class Standstill(Copyable):
     def by_twists(self, odometry: Odometry, t: float, noise: TwistNoise) -> bool:
         """Whether the twists, with some noise, have shown a rest for `STILL_TIME` at t (s).
 
-        Their mean is consistent with rest in this cycle, and since the last measurement of the bias.
+        Their mean is consistent with a rest in each cycle, which shows at once that the vehicle pulls off,
+        and since the last measurement of the bias, which shows a creep.
         """
         twists = odometry.twist[1:] if len(odometry.twist) > 1 else odometry.twist  # the first one is held
-
-        def is_still(total: Array, count: int, since: float) -> bool:
-            allowed = REST_TWIST + REST_SIGMAS * noise.of_mean(count, t - since)
-            return bool((np.abs(total / count) < allowed).all())
-
-        moves = not len(twists) or twists[:, 0].min() > REST_TWIST[0] + REST_SIGMAS * noise.white[0]
-        if moves or not is_still(twists.sum(axis=0), len(twists), odometry.t[0]):
+        count, total = len(twists), twists.sum(axis=0)
+        allowed = REST_TWIST + REST_SIGMAS * noise.white / np.sqrt(max(count, 1))
+        if count == 0 or (np.abs(total / count) > allowed).any():
             self._since = None
             return False
         if self._since is None:
             self._since = self._begin = float(odometry.t[0])
             self._sum, self._count = np.zeros(3), 0
-        self._sum, self._count = self._sum + twists.sum(axis=0), self._count + len(twists)
-        return t - self._since >= STILL_TIME and is_still(self._sum, self._count, self._begin)
+        self._sum, self._count = self._sum + total, self._count + count
+        allowed = REST_TWIST + REST_SIGMAS * noise.of_mean(self._count, t - self._begin)
+        return t - self._since >= STILL_TIME and bool((np.abs(self._sum / self._count) < allowed).all())
 
     def bias(self, t: float, noise: TwistNoise) -> BiasMeasurement | None:
         """Return the bias measured since the last result, if that is `STILL_TIME` ago at t (s)."""
@@ -152,8 +152,7 @@ twists, if that is longer."""
 STANDING: Final = MeasuredMotion(
     integrated_odometry(np.zeros(3), np.diag([5e-4, 5e-4, 5e-5]) ** 2, np.zeros((3, 2))), np.zeros((1, 3))
 )
-"""Motion between two cycles at rest by the twists."""
-SIGMAS_STANDS: Final = (0.02, 0.02, 0.002)  # motion between cycles at rest by detections alone (m, m, rad)
+"""Motion between two cycles at rest."""
 SIGMAS_PULL_OFF: Final = (0.3, 0.05, 0.0)  # motion that odometry misses when a rest ends (m, m, rad)
 
 
@@ -227,7 +226,7 @@ class MotionCheck(Copyable):
             place = standstill.by_cones(self._settings.doubt) if may_contradict else None
         if place is not None:
             back = relative(self.pose, place)
-            covariance = np.diag(SIGMAS_STANDS) ** 2 + np.outer(back, back) * BEFORE**2
+            covariance = STANDING.odometry.covariance + np.outer(back, back) * BEFORE**2
             motion = without_odometry(back, covariance, np.zeros(3), motion)
         else:
             rests = not motion.missing and standstill.by_twists(odometry, t, self.noise)
