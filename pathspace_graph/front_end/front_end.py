@@ -19,7 +19,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
 from .log_odometry import LogOdometry, chained
-from .measurement import SeenCycle, TwistRecord, dead_reckoned
+from .measurement import SeenCycle, dead_reckoned
 from .motion import MotionCheck
 from .noise import NoiseLearner, measure_noise
 from .scan_matching import merged
@@ -158,18 +158,17 @@ def is_orange(detections: Detections) -> BoolArray:
 def measure_log(log: Log, settings: MapperSettings | None = None) -> MeasuredNoise | None:
     """Measure the noise of a whole log and the constant errors of its sensor from its readings alone."""
     settings = settings or MapperSettings()
-    return measure_noise(*seen_cycles(log, settings), of_lines=settings.of_lines)
+    return measure_noise(seen_cycles(log, settings), log.odometry, of_lines=settings.of_lines)
 
 
-def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[SeenCycle], TwistRecord]:
-    """Return the detections of a log with poses by odometry alone, and its twists; odometry is trusted."""
+def seen_cycles(log: Log, settings: MapperSettings | None = None) -> list[SeenCycle]:
+    """Return the detections of a log with poses by odometry alone, which is trusted."""
     settings = settings or MapperSettings()
-    twists, sides, cycles = TwistRecord(), SideJudge(settings.sides), []
-    twists.add(log.odometry)
+    sides, cycles = SideJudge(settings.sides), []
     poses = dead_reckoned(log.odometry, np.array([cycle.t for cycle in log.cycles]))
     for pose, (odometry, detections) in zip(poses, split_odometry(log), strict=True):
         cones, _, in_lane = split_detections(detections, settings)
         labelled = sides.update(pose, odometry.twist, cones, in_lane=in_lane)
         twist = odometry.twist[-1] if len(odometry.t) else np.zeros(3)
         cycles.append(SeenCycle(labelled, pose, twist))
-    return cycles, twists
+    return cycles

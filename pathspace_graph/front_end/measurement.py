@@ -31,7 +31,6 @@ from pathspace_graph.mapping.tracks import Tracks
 
 MAD: Final = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 MOST_TWISTS: Final = 4000  # largest number of newest twists
-MOST_PARTS: Final = 200  # number of stored cycles after which these are reduced to the newest twists
 MIN_SPEED_SHARE: Final = 0.3  # least share of the median speed for the noise in motion
 MIN_TWISTS: Final = 30  # least number of twists for white noise
 
@@ -43,49 +42,33 @@ def dead_reckoned(odometry: Odometry, stamps: Array) -> Array:
     return compose(odometry.poses()[row], se2_exp(odometry.twist[row] * held[:, None]))
 
 
-class TwistRecord(Copyable):
-    """The newest measured twists of a drive."""
+def distinct(parts: Sequence[Odometry]) -> Odometry:
+    """Join odometry without repeated twists, which are held, up to a number of newest ones."""
+    t = np.concatenate([np.zeros(0), *(part.t for part in parts)])
+    twists = np.concatenate([np.zeros((0, 3)), *(part.twist for part in parts)])
+    new = np.ones(len(t), bool)
+    new[1:] = (np.diff(t) > 0.0) & (np.diff(twists, axis=0) != 0.0).any(axis=1)
+    return Odometry(t[new][-MOST_TWISTS:], twists[new][-MOST_TWISTS:])
 
-    def __init__(self) -> None:
-        self._parts: tuple[Odometry, ...] = ()
 
-    def add(self, odometry: Odometry) -> None:
-        self._parts = (*self._parts, odometry)
-        if len(self._parts) > MOST_PARTS:
-            self._parts = (Odometry(*self._newest),)
+def twist_noise(odometry: Odometry) -> tuple[Array, float] | None:
+    """Return the noise (k, 3) of a twist by differences of second to fourth order, and their interval (s).
 
-    @property
-    def _newest(self) -> tuple[Array, Array]:
-        """Return the stamps (n,) and the twists (n, 3) without repeated ones, which are held."""
-        t = np.concatenate([np.zeros(0), *(part.t for part in self._parts)])
-        twists = np.concatenate([np.zeros((0, 3)), *(part.twist for part in self._parts)])
-        new = np.ones(len(t), bool)
-        new[1:] = (np.diff(t) > 0.0) & (np.diff(twists, axis=0) != 0.0).any(axis=1)
-        return t[new][-MOST_TWISTS:], twists[new][-MOST_TWISTS:]
-
-    def white(self) -> tuple[Array, float] | None:
-        """Return the white noise (3,) of a twist, the least of `orders`, and the interval of twists (s)."""
-        orders = self.orders()
-        return None if orders is None else (orders.min(axis=0), float(np.median(np.diff(self._newest[0]))))
-
-    def orders(self) -> Array | None:
-        """Return the noise (k, 3) of a twist by differences of second to fourth order, or None for too few.
-
-        The noise by order k is the scaled median absolute difference over `sqrt(binomial(2 k, k))`. The noise
-        is not white if orders disagree.
-        """
-        _, twists = self._newest
-        if len(twists) < MIN_TWISTS:
-            return None
-        speeds = np.hypot(twists[:, 0], twists[:, 1])
-        drives = speeds > MIN_SPEED_SHARE * np.median(speeds)
-        orders = []
-        for k in (2, 3, 4):
-            inside = np.lib.stride_tricks.sliding_window_view(drives, k + 1).all(axis=1)
-            if inside.sum() >= MIN_TWISTS // 2:
-                differences = np.abs(np.diff(twists, k, axis=0)[inside])
-                orders.append(MAD * np.median(differences, axis=0) / np.sqrt(comb(2 * k, k)))
-        return np.array(orders) if orders else None
+    The noise by order k is the scaled median absolute difference over `sqrt(binomial(2 k, k))`. The least is
+    the white noise; it is not white if orders disagree. None for too few twists.
+    """
+    odometry = distinct([odometry])
+    twists, orders = odometry.twist, list[Array]()
+    if len(twists) < MIN_TWISTS:
+        return None
+    speeds = np.hypot(twists[:, 0], twists[:, 1])
+    drives = speeds > MIN_SPEED_SHARE * np.median(speeds)
+    for k in (2, 3, 4):
+        inside = np.lib.stride_tricks.sliding_window_view(drives, k + 1).all(axis=1)
+        if inside.sum() >= MIN_TWISTS // 2:
+            differences = np.abs(np.diff(twists, k, axis=0)[inside])
+            orders.append(MAD * np.median(differences, axis=0) / np.sqrt(comb(2 * k, k)))
+    return (np.array(orders), float(np.median(np.diff(odometry.t)))) if orders else None
 
 
 # --- sightings of cones ----------------------------------------------------------------------------------

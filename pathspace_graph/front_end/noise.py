@@ -18,7 +18,7 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .line_noise import LineMeasurement
-from .measurement import Measurement, SeenCycle, TwistRecord
+from .measurement import Measurement, SeenCycle, distinct, twist_noise
 
 FIRST: Final = 8.0  # driving time before the first measurement of noise (s)
 AGAIN: Final = 1.5  # growth of the driving time between measurements
@@ -52,7 +52,7 @@ class NoiseLearner(Copyable):
         self.of_sensor = use != "stated"  # whether constant errors are measured: stated noise has none
         self.measured = known.measured  # newest measurement, or the one of a batch on the whole drive
         self._cycles: tuple[SeenCycle, ...] = ()  # newest cycles
-        self._twists = TwistRecord()
+        self._twists: tuple[Odometry, ...] = ()  # newest twists
         self._of_lines = of_lines
         if of_lines:
             import_module("scipy.optimize")  # 50 ms, which no cycle has to spare
@@ -80,7 +80,9 @@ class NoiseLearner(Copyable):
         """Add a cycle at a pose (3,) by dead reckoning; return whether a measurement was completed."""
         if not self.is_learning:
             return False
-        self._twists.add(odometry)
+        self._twists = (*self._twists, odometry)
+        if len(self._twists) > 200:  # cycles, which are joined now and then alone
+            self._twists = (distinct(self._twists),)
         seen = SeenCycle(detections, pose.copy(), motion.odometry.twist)
         self._cycles = (*self._cycles[1 - MOST_CYCLES :], seen)
         if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > DRIVING_SPEED:
@@ -88,7 +90,8 @@ class NoiseLearner(Copyable):
         self._t = detections.t
         if self._measurement is None and self._driven >= self._due:
             self._due = AGAIN * self._driven
-            self._measurement = begun(self._cycles, self._twists, self.measured, of_lines=self._of_lines)
+            twists = distinct(self._twists)
+            self._measurement = begun(self._cycles, twists, self.measured, of_lines=self._of_lines)
         found = None if self._measurement is None else self._measurement.advance()
         if found is None:
             return False
@@ -217,23 +220,23 @@ def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
 
 
 def begun(
-    cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None, *, of_lines: bool
+    cycles: Sequence[SeenCycle], odometry: Odometry, known: MeasuredNoise | None, *, of_lines: bool
 ) -> Measurement | LineMeasurement | None:
     """Start a measurement on cones or on lines; None if not even the odometry's noise can be estimated."""
-    white = twists.white()
-    if white is None:
+    of_twists = twist_noise(odometry)
+    if of_twists is None:
         return None
-    sigma, interval = white
+    sigma, interval = of_twists[0].min(axis=0), of_twists[1]
     found = known or MeasuredNoise(sigma, np.array(ASSUMED_DRIFT), interval)
     found = replace(found, odometry=sigma, interval=interval)
     return (LineMeasurement if of_lines else Measurement)(cycles, found)
 
 
 def measure_noise(
-    cycles: Sequence[SeenCycle], twists: TwistRecord, *, of_lines: bool = False
+    cycles: Sequence[SeenCycle], odometry: Odometry, *, of_lines: bool = False
 ) -> MeasuredNoise | None:
     """Measure the noise of cones or of lines; None if not even the odometry's noise can be estimated."""
-    measurement = begun(cycles, twists, None, of_lines=of_lines)
+    measurement = begun(cycles, odometry, None, of_lines=of_lines)
     if measurement is None:
         return None
     while (found := measurement.advance()) is None:

@@ -29,8 +29,8 @@ from pathspace_graph.front_end.measurement import (
     FOLLOW_RANGE,
     GATE_MOST,
     LEAST_NOISE,
-    TwistRecord,
     dead_reckoned,
+    twist_noise,
 )
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
 from pathspace_graph.io import log as logs
@@ -438,12 +438,11 @@ def side_hints(log: Log) -> list[Hint]:
 
 def _odometry_hints(log: Log) -> list[Hint]:
     """Compare white noise: orders of differences that disagree contain motion as well."""
-    twists = TwistRecord()
-    twists.add(log.odometry)
-    orders, white = twists.orders(), twists.white()
-    if orders is None or white is None:
+    found = twist_noise(log.odometry)
+    if found is None:
         return []
-    (least, interval), stated, hints = white, log.odometry_sigma, []
+    (orders, interval), stated, hints = found, log.odometry_sigma, []
+    least = orders.min(axis=0)
     agree = orders.max(axis=0) < 1.2 * least
     most = np.hypot(least, np.array(ASSUMED_DRIFT) / np.sqrt(interval))
     for which, values, size in (
