@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -120,145 +119,89 @@ def test_what_was_in_force_before_the_newest_cycle_is_left_out() -> None:
 
 # --- what is refused -------------------------------------------------------------------------------------
 
-Bad = tuple[Callable[[], Admitted], str, int | None, str]
-REFUSED: dict[str, Bad] = {
-    "no odometry": (lambda: Gate(LIMITS).admit(None, detections(), NEWEST), "odometry", None, "Odometry"),  # type: ignore[arg-type]
-    "no detections": (lambda: Gate(LIMITS).admit(odometry(), None, NEWEST), "detections", None, "Detections"),  # type: ignore[arg-type]
-    "a stamp that is none": (lambda: through(cycle=detections(None)), "detections.t", None, "number"),
-    "NaN as a stamp": (lambda: through(cycle=detections(np.nan)), "detections.t", None, "found nan"),
-    "infinity as a stamp": (lambda: through(cycle=detections(-np.inf)), "detections.t", None, "-inf"),
-    "nanoseconds": (lambda: through(cycle=detections(1e18)), "detections.t", None, "are in seconds"),
+
+def stamps(row: int, value: float) -> Odometry:
+    return odometry(with_entry(STAMPS, row, value))
+
+
+def twist(row: int, column: int, value: float) -> Odometry:
+    return odometry(twists=with_entry(TWISTS, (row, column), value))
+
+
+MANY = Detections(1.1, np.ones((501, 2)), np.tile(np.eye(2), (501, 1, 1)), np.zeros(501, int))
+STAMPED = {
+    "a stamp that is none": (None, "number"),
+    "NaN as a stamp": (np.nan, "found nan"),
+    "infinity as a stamp": (-np.inf, "-inf"),
+    "nanoseconds": (1e18, "are in seconds"),
+    "milliseconds": (1100.0, "are in seconds"),
+    "a minute ahead": (61.2, "at most 30 s after"),
+    "backwards": (0.9, "later than the newest"),
+    "twice": (1.0, "later than the newest"),
+}
+DRIVEN = {
+    "a twist after the cycle": (odometry(STAMPS + 0.05), "t", 2, "none later than the cycle"),
+    "twists out of order": (odometry(STAMPS[[0, 2, 1]]), "t", 2, "later than the one before"),
+    "a twist twice": (odometry(STAMPS[[0, 1, 1]]), "t", 2, "later than the one"),
+    "NaN as a twist's stamp": (stamps(1, np.nan), "t", 1, "found nan"),
+    "NaN as a speed": (twist(1, 0, np.nan), "twist", 1, "vx from -100 to 100 m/s, found nan"),
+    "infinite speed": (twist(0, 1, np.inf), "twist", 0, "vy from -100 to 100 m/s, found inf"),
+    "no vehicle's speed": (twist(2, 0, -1e5), "twist", 2, "vx from -100 to 100 m/s, found -100000"),
+    "no vehicle's turn": (twist(2, 2, 11.0), "twist", 2, "wz from -10 to 10 rad/s, found 11"),
+    "fewer twists": (
+        odometry(twists=TWISTS[:2]),
+        "twist",
+        None,
+        r"shape \(3, 3\), found .* \(2, 3\)",
+    ),
+    "twists of two numbers": (odometry(twists=TWISTS[:, :2]), "twist", None, "shape"),
+    "words as twists": (odometry(twists=[["a"] * 3] * 3), "twist", None, "numbers"),
+    "ragged twists": (odometry(twists=[[1.0], [1.0, 2.0], []]), "twist", None, "different lengths"),
+}
+SEEN = {
+    "points of three": (
+        detections(points_vehicle=np.zeros((3, 3))),
+        "points_vehicle",
+        None,
+        r"\(m, 2\)",
+    ),
+    "too few covariances": (detections(covariances=np.zeros((2, 2, 2))), "covariances", None, "shape"),
+    "too few labels": (detections(labels=[0]), "labels", None, "shape"),
+    "labels as words": (detections(labels=["left", "right", "left"]), "labels", None, "integers"),
+    "labels as numbers": (detections(labels=np.array([0.0, 1.0, 1.0])), "labels", None, "integers"),
+    "no such label": (detections(labels=np.array([0, 7, 1])), "labels", 1, "found 7"),
+    "too many detections": (MANY, "points_vehicle", None, "at most 500 rows"),
+}
+Refused = tuple[Any, Any, Newest, str, int | None, str]
+REFUSED: dict[str, Refused] = {
+    "no odometry": (None, detections(), NEWEST, "odometry", None, "Odometry"),
+    "no detections": (odometry(), None, NEWEST, "detections", None, "Detections"),
     "nanoseconds at first": (
-        lambda: through(cycle=detections(1.7e18), newest=Newest()),
+        odometry(),
+        detections(1.7e18),
+        Newest(),
         "detections.t",
         None,
         "are in seconds",
     ),
-    "milliseconds": (lambda: through(cycle=detections(1100.0)), "detections.t", None, "are in seconds"),
-    "a minute ahead": (lambda: through(cycle=detections(61.2)), "detections.t", None, "at most 30 s after"),
-    "backwards": (lambda: through(cycle=detections(0.9)), "detections.t", None, "later than the newest"),
-    "at once": (
-        lambda: through(odometry(np.zeros(0), np.zeros((0, 3))), detections(1.0005)),
-        "detections.t",
-        None,
-        "at least 0.001 s after the newest cycle",
-    ),
-    "twice": (lambda: through(cycle=detections(1.0)), "detections.t", None, "later than the newest"),
-    "a twist after the cycle": (
-        lambda: through(odometry(STAMPS + 0.05)),
-        "odometry.t",
-        2,
-        "none later than the cycle",
-    ),
-    "twists out of order": (
-        lambda: through(odometry(STAMPS[[0, 2, 1]])),
-        "odometry.t",
-        2,
-        "later than the one before",
-    ),
-    "a twist twice": (lambda: through(odometry(STAMPS[[0, 1, 1]])), "odometry.t", 2, "later than the one"),
-    "NaN as a twist's stamp": (
-        lambda: through(odometry(with_entry(STAMPS, 1, np.nan))),
-        "odometry.t",
-        1,
-        "found nan",
-    ),
+    "at once": (NONE, detections(1.0005), NEWEST, "detections.t", None, "at least 0.001 s after the newest"),
     "a minute without twists": (
-        lambda: through(odometry(STAMPS + np.array([0.0, 60.0, 60.0])), detections(61.1)),
-        "odometry.t",
-        1,
-        "at most 30 s after the reading at 1 s",
+        *(odometry(STAMPS + np.array([0.0, 60.0, 60.0])), detections(61.1), NEWEST),
+        *("odometry.t", 1, "at most 30 s after the reading at 1 s"),
     ),
-    "NaN as a speed": (
-        lambda: through(odometry(twists=with_entry(TWISTS, (1, 0), np.nan))),
-        "odometry.twist",
-        1,
-        "vx from -100 to 100 m/s, found nan",
-    ),
-    "infinite speed": (
-        lambda: through(odometry(twists=with_entry(TWISTS, (0, 1), np.inf))),
-        "odometry.twist",
-        0,
-        "vy from -100 to 100 m/s, found inf",
-    ),
-    "no vehicle's speed": (
-        lambda: through(odometry(twists=with_entry(TWISTS, (2, 0), -1e5))),
-        "odometry.twist",
-        2,
-        "vx from -100 to 100 m/s, found -100000",
-    ),
-    "no vehicle's turn": (
-        lambda: through(odometry(twists=with_entry(TWISTS, (2, 2), 11.0))),
-        "odometry.twist",
-        2,
-        "wz from -10 to 10 rad/s, found 11",
-    ),
-    "fewer twists than stamps": (
-        lambda: through(odometry(twists=TWISTS[:2])),
-        "odometry.twist",
-        None,
-        r"the shape \(3, 3\), found the shape \(2, 3\)",
-    ),
-    "twists of two numbers": (
-        lambda: through(odometry(twists=TWISTS[:, :2])),
-        "odometry.twist",
-        None,
-        "shape",
-    ),
-    "words as twists": (lambda: through(odometry(twists=[["a"] * 3] * 3)), "odometry.twist", None, "numbers"),
-    "ragged twists": (
-        lambda: through(odometry(twists=[[1.0], [1.0, 2.0], []])),
-        "odometry.twist",
-        None,
-        "different lengths",
-    ),
-    "points of three numbers": (
-        lambda: through(cycle=detections(points_vehicle=np.zeros((3, 3)))),
-        "detections.points_vehicle",
-        None,
-        r"the shape \(m, 2\)",
-    ),
-    "too few covariances": (
-        lambda: through(cycle=detections(covariances=np.zeros((2, 2, 2)))),
-        "detections.covariances",
-        None,
-        "shape",
-    ),
-    "too few labels": (lambda: through(cycle=detections(labels=[0])), "detections.labels", None, "shape"),
-    "labels as words": (
-        lambda: through(cycle=detections(labels=["left", "right", "left"])),
-        "detections.labels",
-        None,
-        "integers",
-    ),
-    "labels as numbers": (
-        lambda: through(cycle=detections(labels=np.array([0.0, 1.0, 1.0]))),
-        "detections.labels",
-        None,
-        "integers",
-    ),
-    "no such label": (
-        lambda: through(cycle=detections(labels=np.array([0, 7, 1]))),
-        "detections.labels",
-        1,
-        "found 7",
-    ),
-    "too many detections": (
-        lambda: through(
-            cycle=Detections(1.1, np.ones((501, 2)), np.tile(np.eye(2), (501, 1, 1)), np.zeros(501, int))
-        ),
-        "detections.points_vehicle",
-        None,
-        "at most 500 rows",
-    ),
+    **{
+        k: (odometry(), detections(t), NEWEST, "detections.t", None, said) for k, (t, said) in STAMPED.items()
+    },
+    **{k: (own, detections(), NEWEST, f"odometry.{f}", *said) for k, (own, f, *said) in DRIVEN.items()},
+    **{k: (odometry(), own, NEWEST, f"detections.{f}", *said) for k, (own, f, *said) in SEEN.items()},
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_be_used_is_named_with_field_row_and_what_was_expected(name: str) -> None:
-    call, field, row, text = REFUSED[name]
+    given, cycle, newest, field, row, text = REFUSED[name]
     with pytest.raises(ReadingError, match=text) as caught:
-        call()
+        Gate(LIMITS).admit(given, cycle, newest)
     assert (caught.value.field, caught.value.row) == (field, row)
     assert field in str(caught.value)
     assert isinstance(caught.value, PathspaceError)

@@ -6,24 +6,12 @@ import numpy as np
 import pytest
 
 from pathspace_graph.front_end.log_odometry import chained, half_square, sensor_prior
-from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, control_keys, pose_keys
+from pathspace_graph.graph.variables import SENSOR_KEY, Variables, pose_keys
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry
 from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
 
 KNOWN, ESTIMATED = CalibrationSettings(sensor=False), CalibrationSettings()
-
-
-def test_both_calibrations_are_one_view() -> None:
-    variables = Variables()
-    variables.insert_calibrations(np.arange(7.0))
-    variables.insert(control_keys(0, np.arange(2)), np.zeros(4))
-    variables.insert(pose_keys(np.arange(1)), np.zeros(3))
-    np.testing.assert_array_equal(variables.calibrations, np.arange(7.0))
-    np.testing.assert_array_equal(variables.calibration_keys, [CALIBRATION_KEY, SENSOR_KEY])
-    variables.calibrations[:] = 1.0
-    np.testing.assert_array_equal(variables.calibration, 1.0)
-    np.testing.assert_array_equal(variables.sensor, 1.0)
 
 
 def test_the_prior_counts_in_its_sigmas() -> None:

@@ -136,7 +136,7 @@ def test_a_long_drive_keeps_the_newest_twists_alone() -> None:
 
 
 def test_a_pose_between_two_twists_is_on_the_arc_of_the_first_one() -> None:
-    """A quarter of a circle of radius 5 m in 1 s, then straight ahead; before the first twist nothing moves."""
+    """A quarter of a circle of radius 5 m in 1 s, then straight ahead; nothing moves before the first."""
     turn = 0.5 * np.pi
     odometry = Odometry(np.array([10.0, 11.0]), np.array([[5.0 * turn, 0.0, turn], [4.0, 0.0, 0.0]]))
     found = dead_reckoned(odometry, np.array([9.0, 10.5, 11.0, 12.5]))
