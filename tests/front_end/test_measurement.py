@@ -35,7 +35,7 @@ from pathspace_graph.front_end.measurement import (
 )
 from pathspace_graph.front_end.noise import begun, measure_noise
 from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.labels import LEFT
 from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.sim.vehicle import integrate
@@ -190,28 +190,6 @@ def test_two_cones_two_metres_apart_stay_two(offset: tuple[float, float]) -> Non
     places = found.point + found.pose[:, :2]
     for cone in (0, 1):
         assert np.ptp(places[found.cone == cone], axis=0).max() < 1e-9
-
-
-def test_cones_of_two_colours_at_one_place_are_two() -> None:
-    cones = np.array([[15.0, 2.0], [15.1, 2.0]])
-    assert counts(follow(drive((8.0, 0.0, 0.0), 10, cones, [LEFT, RIGHT]), NO_ERRORS)) == [10, 10]
-
-
-def test_what_two_cameras_see_of_one_cone_all_counts() -> None:
-    """The second one sees each cone 0.3 m farther away, and to leave one out would be to prefer a range."""
-    cones = np.array([[12.0, 2.0], [16.0, 2.0]])
-    cycles = drive((8.0, 0.0, 0.0), 10, cones)
-    twice, farther = [], []
-    for cycle in cycles:
-        points = cycle.detections.points_vehicle
-        farther.append(points * (1.0 + 0.3 / np.hypot(*points.T))[:, None])
-        both = np.concatenate([farther[-1], points])
-        labels = np.full(len(both), LEFT, np.intp)
-        twice.append(SeenCycle(detections(cycle.detections.t, both, labels), cycle.pose, cycle.twist))
-    found = follow(twice, NO_ERRORS)
-    assert counts(found) == [10] * 4
-    expected = np.concatenate([*farther, *(cycle.detections.points_vehicle for cycle in cycles)])
-    np.testing.assert_array_equal(found.point[np.lexsort(found.point.T)], expected[np.lexsort(expected.T)])
 
 
 def test_a_cone_that_was_long_out_of_sight_is_another_one() -> None:
