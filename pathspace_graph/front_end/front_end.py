@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.copies import Copyable
-from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.arrays import BoolArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.results import RunNoise
@@ -65,7 +65,7 @@ class FrontEnd(Copyable):
 
     def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
         """Return a usable cycle; raise a ReadingError for any other."""
-        return self.gate.admit(odometry, detections, self._motion.newest)
+        return self.gate.admit(odometry, detections, self._motion.t, self._motion.twist)
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Check the readings of a cycle: the twists since the previous one, and its detections."""
@@ -105,11 +105,6 @@ class FrontEnd(Copyable):
     @property
     def noise_used(self) -> RunNoise:
         return self.noise.used(self._settings)
-
-    @property
-    def pose(self) -> Array:
-        """Copy of the newest pose (3,) by odometry alone."""
-        return self._motion.pose.copy()
 
 
 @dataclass(frozen=True, eq=False)

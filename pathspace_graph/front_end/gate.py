@@ -41,14 +41,6 @@ MAX_SIGMA: Final = 100.0  # largest standard deviation of a detection in any dir
 
 
 @dataclass(frozen=True, eq=False)
-class Newest:
-    """Stamp and twist of the newest admitted cycle; None before the first one."""
-
-    t: float | None = None  # stamp (s)
-    twist: Array | None = None  # (3,) newest measured twist (m/s, m/s, rad/s)
-
-
-@dataclass(frozen=True, eq=False)
 class Admitted:
     """A usable perception cycle, in arrays of its own."""
 
@@ -77,10 +69,17 @@ class Gate(Copyable):
         self._refused_at: float | None = None  # stamp (s) of the previous cycle, if it was refused
         self._dropping = False  # whether the previous cycle had impossible detections
 
-    def admit(self, odometry: Odometry, detections: Detections, newest: Newest) -> Admitted:
+    def admit(
+        self,
+        odometry: Odometry,
+        detections: Detections,
+        newest: float | None = None,
+        twist: Array | None = None,
+    ) -> Admitted:
         """Return a usable cycle; otherwise raise a ReadingError and count it as refused.
 
-        Each twist is held until the next one. Twists that end before the newest cycle are left out.
+        `newest` is the stamp (s) of the newest admitted cycle, and `twist` (3,) the newest one measured. Each
+        twist is held until the next one. Twists that end before the newest cycle are left out.
         """
         refused, before, said = self.refused, self._refused_at, getattr(detections, "t", None)
         now = float(said) if isinstance(said, int | float) and abs(said) < inf else None
@@ -99,16 +98,22 @@ class Gate(Copyable):
         try:
             possible, notice = _possible_detections(detections, t, self.limits, self._most)
             stamps, twists = _checked_twists(odometry, self.limits)
-            _check_order(stamps, t, newest.t, silence)
+            _check_order(stamps, t, newest, silence)
         except ReadingError as error:
             raise error.at(t) from None
         dropped, notice = len(detections.labels) - len(possible.labels), "" if self._dropping else notice
         self.refused, self._refused_at, self._dropping = 0, None, dropped > 0
-        since = _since(Odometry(stamps, twists), newest)
+        if newest is not None:
+            first = int(stamps.searchsorted(newest, side="right")) - 1
+            if first >= 0:
+                stamps, twists = stamps[first:], twists[first:]
+                stamps[0] = newest
+            elif twist is not None:
+                stamps, twists = np.append(newest, stamps), np.concatenate([twist[None], twists])
         count = len(possible.labels)
         one_of = max(-(-count // MOST_DETECTIONS), 1)  # of every few, where there are more than the most
         possible = possible.where(np.arange(count) % one_of == 0)
-        return Admitted(since, possible, dropped, refused, notice)
+        return Admitted(Odometry(stamps, twists), possible, dropped, refused, notice)
 
     def refuse(self) -> None:
         self.refused += 1
@@ -116,10 +121,10 @@ class Gate(Copyable):
 
 def check_usable(log: Log, folder: Path, limits: LimitSettings) -> None:
     """Raise an InputError of the log in a folder, with row and stamp, where a cycle is unusable."""
-    gate, newest = Gate(limits, of_lines=log.sensor.kind == "line"), Newest()
+    gate, newest, twist = Gate(limits, of_lines=log.sensor.kind == "line"), None, None
     for odometry, detections in split_odometry(log.at_scale_one()):
         try:
-            admitted = gate.admit(odometry, detections, newest)
+            admitted = gate.admit(odometry, detections, newest, twist)
         except ReadingError as error:
             file, row = DETECTIONS_FILE, None
             if error.field.startswith("odometry"):
@@ -128,7 +133,7 @@ def check_usable(log: Log, folder: Path, limits: LimitSettings) -> None:
                     row = int(log.odometry.t.searchsorted(odometry.t[error.row], side="right")) + 1
             text = str(ReadingError(error.field, error.expected, error.found, t=error.t))
             raise InputError(folder / file, text, row) from error
-        newest = Newest(detections.t, admitted.odometry.twist[-1] if len(admitted.odometry.t) else None)
+        newest, twist = detections.t, admitted.odometry.twist[-1] if len(admitted.odometry.t) else None
 
 
 def _check_order(stamps: Array, t: float, newest: float | None, silence: float) -> None:
@@ -178,20 +183,6 @@ def _require(good: BoolArray, field: str, expected: str, values: NDArray[Any]) -
     if not good.all():
         row = int(good.argmin())
         raise ReadingError(field, expected, values[row].item(), row)
-
-
-def _since(odometry: Odometry, newest: Newest) -> Odometry:
-    """Return the twists in force since the newest cycle; the first one starts there."""
-    if newest.t is None:
-        return odometry
-    stamps, twists = odometry.t, odometry.twist
-    first = int(stamps.searchsorted(newest.t, side="right")) - 1
-    if first >= 0:
-        stamps, twists = stamps[first:], twists[first:]
-        stamps[0] = newest.t
-    elif newest.twist is not None:
-        stamps, twists = np.append(newest.t, stamps), np.concatenate([newest.twist[None], twists])
-    return Odometry(stamps, twists)
 
 
 def _possible_detections(

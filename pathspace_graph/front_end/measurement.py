@@ -264,7 +264,15 @@ def _noise_by_range(cones: _Cones, errors: Array, noise: Rays, odometry: Array) 
     known = np.array([odometry[0] ** 2 * means[:, 0], across * means[:, 0]])
     for axis, one in enumerate(noise):
         known[axis] += means[:, 3 + axis] ** 2 * np.maximum(1.0 / references, one.share)
-    pairs, cone_count = _pairs(table.cone[rows], table.t[rows]), len(np.unique(table.cone[rows]))
+    # ordered pairs of sightings i, j of one cone with a lag within `LAGS`; they are sorted by cone
+    firsts, sizes = runs(table.cone[rows])
+    repeats = np.repeat(sizes, sizes)
+    i = np.repeat(np.arange(len(rows)), repeats)
+    nth = np.arange(len(i)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+    j = np.repeat(np.repeat(firsts, sizes), repeats) + nth
+    lag = table.t[rows][j] - table.t[rows][i]
+    inside = (lag >= LAGS[0]) & (lag < LAGS[-1])
+    pairs = i[inside], j[inside], lag[inside], np.digitize(lag[inside], LAGS)
     order, bins = np.argsort(ranges), np.arange(max(min(BINS, len(rows) // (MIN_ROWS // 2)), 2))
     counts = len(rows) // len(bins) + (bins < len(rows) % len(bins))  # bins of equal count, by range
     begins, found = counts.cumsum() - counts, list[RayNoise]()
@@ -279,21 +287,9 @@ def _noise_by_range(cones: _Cones, errors: Array, noise: Rays, odometry: Array) 
         sigma = np.sqrt(np.clip(variances, 0.25 * scatter, 4.0 * scatter))
         line = RayNoise(np.maximum(line_through(middle, sigma), least))
         share, time = _staying(*pairs, off, variance, line.sigmas(ranges))
-        share = (cone_count * share + 8.0 * 0.5) / (cone_count + 8.0)  # a prior of half, worth eight cones
+        share = (len(sizes) * share + 8.0 * 0.5) / (len(sizes) + 8.0)  # a prior of half, worth eight cones
         found.append(replace(line, share=share, time=time))
     return found[0], found[1]
-
-
-def _pairs(cone: IntArray, t: Array) -> tuple[IntArray, IntArray, Array, IntArray]:
-    """Return ordered pairs of sightings (k,) of one cone, their lags (s), and the bins of these in `LAGS`."""
-    begins, counts = runs(cone)
-    repeats = np.repeat(counts, counts)
-    i = np.repeat(np.arange(len(cone)), repeats)
-    nth = np.arange(len(i)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
-    j = np.repeat(np.repeat(begins, counts), repeats) + nth
-    lag = t[j] - t[i]
-    inside = (lag >= LAGS[0]) & (lag < LAGS[-1])
-    return i[inside], j[inside], lag[inside], np.digitize(lag[inside], LAGS)
 
 
 class Measurement(Copyable):

@@ -15,7 +15,6 @@ from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
 from pathspace_graph.settings.online import MotionSettings
 
-from .gate import Newest
 from .scan_matching import (
     MIN_DOUBTING,
     MOST_MISFIT,
@@ -59,7 +58,7 @@ class Standstill(Copyable):
     def forget(self) -> None:
         """Forget the cones, as they were corrected otherwise."""
         self._cycles: tuple[_Cycle, ...] = ()  # newest first
-        self._poses: tuple[Array, ...] = ()  # (3,) accepted poses of these cycles
+        self._poses: tuple[Array, ...] = ()  # (3,) accepted poses of all but the newest of these
 
     def by_twists(self, odometry: Odometry, t: float, noise: TwistNoise) -> bool:
         """Whether the twists, with some noise, have shown a rest for `STILL_TIME` at t (s).
@@ -93,8 +92,11 @@ class Standstill(Copyable):
         """End a rest that the twists show and the detections contradict."""
         self._since = None
 
-    def add(self, t: float, points: Array, covariances: Array, delta: Array) -> None:
-        """Add corrected detections (n, 2), vehicle frame, at t (s) after the motion (3,) by odometry."""
+    def add(self, t: float, points: Array, covariances: Array, delta: Array, pose: Array) -> None:
+        """Add corrected detections (n, 2), vehicle frame, at t (s) after the motion (3,) by odometry.
+
+        pose (3,) is the accepted one of the cycle before.
+        """
         cycles = self._cycles
         by_odometry = compose(cycles[0].by_odometry, delta) if cycles else np.zeros(3)
         if cycles and np.hypot(delta[0], delta[1]) > CREEP * (t - cycles[0].t):
@@ -105,11 +107,7 @@ class Standstill(Copyable):
             points, covariances, by_odometry, others, HYPOTHESES, SIGMA_CONE, MOST_MISFIT
         )
         newest = _Cycle(t, points, by_odometry, gains.cumsum(axis=1))
-        self._cycles, self._poses = (newest, *cycles), (by_odometry, *self._poses[: len(cycles)])
-
-    def believe(self, pose: Array) -> None:
-        """Set the accepted pose (3,) of the newest cycle."""
-        self._poses = (pose, *self._poses[1:])
+        self._cycles, self._poses = (newest, *cycles), (pose, *self._poses)[: len(cycles)]
 
     def by_cones(self, limit: float) -> Array | None:
         """Return the pose (3,) at which the vehicle stands, or None if it may move.
@@ -131,7 +129,7 @@ class Standstill(Copyable):
         likelier = np.where(possible, likelier, 0.0)
         if not likelier.max(initial=0.0) > limit**2:
             return None
-        first = 1 + int(likelier.argmax())
+        first = int(likelier.argmax())
         pose = self._poses[first]
         self._poses = first * (pose,) + self._poses[first:]
         return pose
@@ -186,9 +184,9 @@ class MotionCheck(Copyable):
         self._matcher = ScanMatcher(settings, of_lines=of_lines)
         self._standstill, self._rests = Standstill(), False
         self._velocity: Array | None = None
-        self._t: float | None = None
+        self.t: float | None = None  # stamp of the newest cycle (s)
         self._doubted_at = -np.inf  # stamp of the last contradiction (s)
-        self._twist: Array | None = None  # (3,) newest measured twist
+        self.twist: Array | None = None  # (3,) newest measured twist (m/s, m/s, rad/s)
         self._twist_t = -np.inf  # its stamp (s)
         self._twist_interval = np.inf  # shortest time between measured twists (s)
 
@@ -202,10 +200,6 @@ class MotionCheck(Copyable):
     def errors(self) -> SensorErrors:
         """Yaw and latency of the sensor, learned so far."""
         return self._matcher.errors
-
-    @property
-    def newest(self) -> Newest:
-        return Newest(self._t, self._twist)
 
     def update(
         self, odometry: Odometry, detections: Detections, *, may_contradict: bool = True
@@ -222,7 +216,7 @@ class MotionCheck(Copyable):
         seen, agrees, place = matcher.corrected(detections, twist), None, None
         if not self._of_lines:
             covariances = matcher.excess * detections.covariances
-            standstill.add(t, seen.points, covariances, motion.odometry.delta)
+            standstill.add(t, seen.points, covariances, motion.odometry.delta, self.pose)
             place = standstill.by_cones(self._settings.doubt) if may_contradict else None
         if place is not None:
             back = relative(self.pose, place)
@@ -247,11 +241,10 @@ class MotionCheck(Copyable):
         else:
             self.seen_again = matcher.has(seen, self.pose)
         matcher.remember(detections, motion.odometry.twist if motion.fault else twist, self.pose)
-        standstill.believe(self.pose)
-        if self._t is not None and t > self._t:
-            self._velocity = motion.odometry.delta / (t - self._t)
-            matcher.errors.follow(self._velocity, t - self._t)
-        self._t = t
+        if self.t is not None and t > self.t:
+            self._velocity = motion.odometry.delta / (t - self.t)
+            matcher.errors.follow(self._velocity, t - self.t)
+        self.t = t
         return motion
 
     def _by_odometry(self, odometry: Odometry, t: float) -> MeasuredMotion:
@@ -261,15 +254,15 @@ class MotionCheck(Copyable):
         """
         if len(odometry.t) == 0:  # no motion, with certainty
             none = integrate_twists(np.zeros(0), odometry.twist, self.noise.white)
-            return MeasuredMotion(none, odometry.twist, missing=self._t is not None)
+            return MeasuredMotion(none, odometry.twist, missing=self.t is not None)
         stamps, twists, first = odometry.t, odometry.twist, float(odometry.t[0])
-        goes_on = self._twist is not None and (twists[0] == self._twist).all()
-        if self._t is not None and first <= self._t and goes_on:
+        goes_on = self.twist is not None and (twists[0] == self.twist).all()
+        if self.t is not None and first <= self.t and goes_on:
             first = self._twist_t  # the first row repeats it
         durations, excess, self._twist_interval, missing, same = kernels.held_twists(
             stamps, twists, t, first, self._twist_interval, HOLD, self._settings.accelerations
         )
-        self._twist, self._twist_t = twists[-1], float(stamps[-1]) if len(stamps) > 1 else first
+        self.twist, self._twist_t = twists[-1], float(stamps[-1]) if len(stamps) > 1 else first
         integrated = integrate_twists(durations, twists, np.hypot(self.noise.sigmas(durations), excess))
         stuck = same >= 3  # number of twists equal to the previous one
         return MeasuredMotion(integrated, twists, False, missing, stuck, None, durations, excess)
@@ -285,10 +278,10 @@ class MotionCheck(Copyable):
         where it is missing, or stuck at a velocity to which no vehicle jumps; then the last hypothesis is
         constant velocity.
         """
-        if self._t is None or t <= self._t:
+        if self.t is None or t <= self.t:
             return motion, None
         limit = GATE_DISTRUSTED if t - self._doubted_at < DISTRUST else self._settings.doubt
-        matcher, odometry, dt = self._matcher, motion.odometry, t - self._t
+        matcher, odometry, dt = self._matcher, motion.odometry, t - self.t
         sigmas = np.array(SIGMAS_CHANGE) * dt
         largest = 3.0 * matcher.excess  # misfits are 1 where the vehicle moved, 4 where it was put down
         going_on = dt * (odometry.twist if self._velocity is None else self._velocity)

@@ -114,7 +114,7 @@ class NoiseLearner(Copyable):
         Their covariances are inflated so that sightings of one cone count as independent.
         """
         measured, points = self.measured, detections.points_vehicle
-        if not self.of_sensor or measured is None:
+        if not self.of_sensor or measured is None or len(points) == 0:
             return detections
         covariances = measured.covariances(points, inflated=True) if self.of_detections else None
         if covariances is None:

@@ -227,7 +227,7 @@ def stands(points: Array, cycles: int, odometry: Array) -> Standstill:
     """A vehicle that sees the same points in each cycle, half a second apart, while its odometry moves."""
     standstill, covariances = Standstill(), np.tile(1e-4 * np.eye(2), (len(points), 1, 1))
     for k in range(cycles):
-        standstill.add(0.5 * k, points, covariances, odometry if k else np.zeros(3))
+        standstill.add(0.5 * k, points, covariances, odometry if k else np.zeros(3), k * odometry)
     return standstill
 
 
@@ -263,7 +263,7 @@ def test_wheels_that_turn_faster_than_a_creep_are_not_compared_with_earlier_cycl
     covariances = np.tile(0.01 * np.eye(2), (len(points), 1, 1))
     for k in range(11):
         delta = np.array([PERIOD * speed if k == 10 else 0.0, 0.0, 0.0])
-        standstill.add(PERIOD * k, points, covariances, delta)
+        standstill.add(PERIOD * k, points, covariances, delta, np.zeros(3))
     assert (standstill.by_cones(1.0) is not None) is stands
 
 
