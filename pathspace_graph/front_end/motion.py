@@ -88,10 +88,6 @@ class Standstill(Copyable):
         self._begin, self._sum, self._count = t, np.zeros(3), 0
         return measured
 
-    def leave(self) -> None:
-        """End a rest that the twists show and the detections contradict."""
-        self._since = None
-
     def add(self, t: float, points: Array, covariances: Array, delta: Array, pose: Array) -> None:
         """Add corrected detections (n, 2), vehicle frame, at t (s) after the motion (3,) by odometry.
 
@@ -225,8 +221,6 @@ class MotionCheck(Copyable):
         else:
             rests = not motion.missing and standstill.by_twists(odometry, t, self.noise)
             motion, agrees = self._likeliest(motion, t, seen, rests, may_contradict)
-            if rests and motion is not STANDING:
-                standstill.leave()
         if motion.doubted:
             self._doubted_at = t
         if not motion.fault:
