@@ -209,7 +209,7 @@ class MotionCheck(Copyable):
         t, matcher, standstill = detections.t, self._matcher, self._standstill
         motion = self._by_odometry(odometry, t)
         twist = motion.odometry.twist
-        seen, agrees, place = matcher.corrected(detections, twist), None, None
+        seen, place = matcher.corrected(detections, twist), None
         if not self._of_lines:
             covariances = matcher.excess * detections.covariances
             standstill.add(t, seen.points, covariances, motion.odometry.delta, self.pose)
@@ -220,7 +220,7 @@ class MotionCheck(Copyable):
             motion = without_odometry(back, covariance, np.zeros(3), motion)
         else:
             rests = not motion.missing and standstill.by_twists(odometry, t, self.noise)
-            motion, agrees = self._likeliest(motion, t, seen, rests, may_contradict)
+            motion = self._likeliest(motion, t, seen, rests, may_contradict)
         if motion.doubted:
             self._doubted_at = t
         if not motion.fault:
@@ -230,10 +230,7 @@ class MotionCheck(Copyable):
             elif rested:
                 motion = motion.with_missed(np.array(SIGMAS_PULL_OFF), self.noise)
         self.pose = compose(self.pose, motion.odometry.delta)
-        if agrees is not None and not self._of_lines:
-            self.seen_again = agrees.is_matched
-        else:
-            self.seen_again = matcher.has(seen, self.pose)
+        self.seen_again = matcher.has(seen, self.pose)
         matcher.remember(detections, motion.odometry.twist if motion.fault else twist, self.pose)
         if self.t is not None and t > self.t:
             self._velocity = motion.odometry.delta / (t - self.t)
@@ -263,8 +260,8 @@ class MotionCheck(Copyable):
 
     def _likeliest(
         self, motion: MeasuredMotion, t: float, seen: Seen, rests: bool, may_contradict: bool
-    ) -> tuple[MeasuredMotion, Match | None]:
-        """Return the motion that the detections agree with, and the match that agrees, if there is one.
+    ) -> MeasuredMotion:
+        """Return the motion that the detections agree with.
 
         The hypotheses are, in this order, standing still if the vehicle `rests` by the twists, and the
         odometry, each if a match beside it agrees; then the best match that is possible after the newest
@@ -273,7 +270,7 @@ class MotionCheck(Copyable):
         constant velocity.
         """
         if self.t is None or t <= self.t:
-            return motion, None
+            return motion
         limit = GATE_DISTRUSTED if t - self._doubted_at < DISTRUST else self._settings.doubt
         matcher, odometry, dt = self._matcher, motion.odometry, t - self.t
         sigmas = np.array(SIGMAS_CHANGE) * dt
@@ -291,9 +288,9 @@ class MotionCheck(Copyable):
                 difference = matcher.difference(near, one.odometry, predicted)
                 if difference.square <= limit**2:
                     matcher.agree(near, difference, dt)
-                    return one, near
+                    return one
         if not may_contradict and not failed:
-            return motion, None
+            return motion
         starts, possible = (compose(self.pose, going_on), predicted), list[Match]()
         for start in starts:
             found = matcher.match(seen, start, REACHES)
@@ -301,7 +298,7 @@ class MotionCheck(Copyable):
                 possible.append(found)
         best = max(possible, key=lambda one: one.matched - one.misfit, default=None)
         if best is None and not failed:
-            return motion, None
+            return motion
         delta, covariance = going_on, np.diag(sigmas**2)
         if best is not None:
             difference = matcher.difference(best, odometry, predicted)
@@ -310,7 +307,7 @@ class MotionCheck(Copyable):
                 at_odometry, at_match = (matcher.misfit(matched, pose) for pose in (predicted, best.pose))
                 fits_better = at_odometry > max(2.0, 1.3 * at_match)
                 if difference.square <= limit**2 or not fits_better:
-                    return motion, None
+                    return motion
             mean = going_on.copy()
             gyro_is_right = abs(difference.off[2]) <= DOUBT_RATE * np.sqrt(difference.spread[2, 2])
             if gyro_is_right and not (motion.missing or motion.stuck):
@@ -321,4 +318,4 @@ class MotionCheck(Copyable):
             delta = covariance @ (information @ relative(self.pose, best.pose) + prior @ mean)
             off = (0.0 if motion.missing else BEFORE) * (delta - odometry.delta)
             covariance += np.outer(off, off)
-        return without_odometry(delta, covariance, delta / dt, motion), None
+        return without_odometry(delta, covariance, delta / dt, motion)
