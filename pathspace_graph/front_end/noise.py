@@ -23,17 +23,13 @@ from .measurement import Measurement, SeenCycle, distinct, twist_noise
 FIRST: Final = 8.0  # driving time before the first measurement of noise (s)
 AGAIN: Final = 1.5  # growth of the driving time between measurements
 MOST_CYCLES: Final = 300  # largest number of newest cycles in a measurement, which bounds its time
-DRIVING_SPEED: Final = 0.3  # least speed of driving (m/s)
 SCALE: Final = SENSOR.index("range_scale")  # index of the scale error of the ranges
-BIAS: Final = SENSOR.index("range_bias")  # index of their bias
 DOUBT_SCALE: Final = (0.8, 0.5)
 """Contradiction of the scale by that of another error: alone, and beside a contradicted one.
 
 A disagreement of ranges and speeds is likelier an error of 3 % of the ranges than one of the odometry from
 3.2 sigmas of the latter on if every twentieth sensor has such an error, and from 2.0 if every other one has.
 """
-SIGMA_FREE: Final = 0.02  # prior sigma of the scale of the ranges where odometry sets the size (-)
-REFERENCE_RANGE: Final = 10.0  # range at which the noise of ranges bounds their scale error (m)
 
 
 class NoiseLearner(Copyable):
@@ -85,7 +81,7 @@ class NoiseLearner(Copyable):
             self._twists = (distinct(self._twists),)
         seen = SeenCycle(detections, pose.copy(), motion.odometry.twist)
         self._cycles = (*self._cycles[1 - MOST_CYCLES :], seen)
-        if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > DRIVING_SPEED:
+        if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > 0.3:  # m/s
             self._driven += min(detections.t - self._t, 1.0)
         self._t = detections.t
         if self._measurement is None and self._driven >= self._due:
@@ -144,7 +140,8 @@ class NoiseLearner(Copyable):
         # The prior of the ranges' scale is knowledge of the sensor if the log states it, or covariances at
         # least. Ranges that bend, or have a contradicted scale, are not calibrated; those with a bias hardly
         # are, unless the log says so.
-        known = self.known.sigma_range_scale is not None or not (self.of_detections or contradicted[BIAS])
+        is_biased = contradicted[SENSOR.index("range_bias")]
+        known = self.known.sigma_range_scale is not None or not (self.of_detections or is_biased)
         known = known and not (sensor.trust is not None or contradicted[SCALE] or measured.range_bend)
         if not contradicted.any() and (known or sensor.trust is not None):
             return settings
@@ -154,7 +151,7 @@ class NoiseLearner(Copyable):
             means[SCALE], sigmas[SCALE] = sensor.range_scale, sensor.sigma_range_scale
         elif self.trusts_odometry(settings):
             odometry = replace(odometry, hold_scale=True)
-            sigmas[SCALE] = SIGMA_FREE
+            sigmas[SCALE] = 0.02  # hardly a prior
         else:
             if contradicted[SCALE]:
                 scale, sigma = float(means[SCALE]), max(float(sigmas[SCALE]), odometry.sigma_scale)
@@ -203,13 +200,13 @@ class NoiseLearner(Copyable):
         """Whether the odometry sets the size of the map; by default if its scale is better known.
 
         Systematic errors of a sensor are at least as large as its noise, so the scale of its ranges is known
-        no better than a single range.
+        no better than a single range of 10 m.
         """
         measured, trust = self.measured, settings.calibration.trust
         if trust is not None or measured is None or measured.along is None:
             return trust == "odometry"
-        sigma = float(measured.along.sigmas(np.array([REFERENCE_RANGE]))[0])
-        return sigma > REFERENCE_RANGE * settings.odometry.sigma_scale
+        sigma = float(measured.along.sigmas(np.array([10.0]))[0])
+        return sigma > 10.0 * settings.odometry.sigma_scale
 
 
 def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
