@@ -42,7 +42,7 @@ def dead_reckoned(odometry: Odometry, stamps: Array) -> Array:
     return compose(odometry.poses()[row], se2_exp(odometry.twist[row] * held[:, None]))
 
 
-def distinct(parts: Sequence[Odometry]) -> Odometry:
+def without_repeats(parts: Sequence[Odometry]) -> Odometry:
     """Join odometry without repeated twists, which are held, up to a number of newest ones."""
     t = np.concatenate([np.zeros(0), *(part.t for part in parts)])
     twists = np.concatenate([np.zeros((0, 3)), *(part.twist for part in parts)])
@@ -57,7 +57,7 @@ def twist_noise(odometry: Odometry) -> tuple[Array, float] | None:
     The noise by order k is the scaled median absolute difference over `sqrt(binomial(2 k, k))`. The least is
     the white noise; it is not white if orders disagree. None for too few twists.
     """
-    odometry = distinct([odometry])
+    odometry = without_repeats([odometry])
     twists, orders = odometry.twist, list[Array]()
     if len(twists) < MIN_TWISTS:
         return None

@@ -18,7 +18,7 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .line_noise import LineMeasurement
-from .measurement import Measurement, SeenCycle, distinct, twist_noise
+from .measurement import Measurement, SeenCycle, twist_noise, without_repeats
 
 FIRST: Final = 8.0  # driving time before the first measurement of noise (s)
 AGAIN: Final = 1.5  # growth of the driving time between measurements
@@ -78,7 +78,7 @@ class NoiseLearner(Copyable):
             return False
         self._twists = (*self._twists, odometry)
         if len(self._twists) > 200:  # cycles, which are joined now and then alone
-            self._twists = (distinct(self._twists),)
+            self._twists = (without_repeats(self._twists),)
         seen = SeenCycle(detections, pose.copy(), motion.odometry.twist)
         self._cycles = (*self._cycles[1 - MOST_CYCLES :], seen)
         if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > 0.3:  # m/s
@@ -86,7 +86,7 @@ class NoiseLearner(Copyable):
         self._t = detections.t
         if self._measurement is None and self._driven >= self._due:
             self._due = AGAIN * self._driven
-            twists = distinct(self._twists)
+            twists = without_repeats(self._twists)
             self._measurement = begun(self._cycles, twists, self.measured, of_lines=self._of_lines)
         found = None if self._measurement is None else self._measurement.advance()
         if found is None:

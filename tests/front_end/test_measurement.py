@@ -30,8 +30,8 @@ from pathspace_graph.front_end.measurement import (
     SeenCycle,
     Sightings,
     dead_reckoned,
-    distinct,
     twist_noise,
+    without_repeats,
 )
 from pathspace_graph.front_end.noise import begun, measure_noise
 from pathspace_graph.io.log import Detections, Log, Odometry
@@ -57,7 +57,7 @@ WHITE = np.array([0.06, 0.03, 0.004])
 def white(t: Array, twists: Array) -> tuple[Array, float] | None:
     """White noise and interval of twists that come some for each cycle."""
     parts = [Odometry(t[begin : begin + 7], twists[begin : begin + 7]) for begin in range(0, len(t), 7)]
-    found = twist_noise(distinct(parts))
+    found = twist_noise(without_repeats(parts))
     return None if found is None else (found[0].min(axis=0), found[1])
 
 
@@ -91,7 +91,7 @@ def test_a_twist_that_a_cycle_hands_on_from_the_one_before_counts_once() -> None
     """The first twist of a cycle is the one in force when it began, at a stamp that may be in the past."""
     t, twists = noisy_twists(20.0, 200, 3)
     parts = [slice(max(begin - 1, 0), begin + 5) for begin in range(0, 200, 5)]
-    found = distinct([Odometry(t[part], twists[part]) for part in parts])
+    found = without_repeats([Odometry(t[part], twists[part]) for part in parts])
     np.testing.assert_array_equal(found.t, t)
     np.testing.assert_array_equal(found.twist, twists)
 
@@ -126,7 +126,7 @@ def test_a_long_drive_keeps_the_newest_twists_alone() -> None:
     count = 2 * MOST_TWISTS
     t, twists = noisy_twists(40.0, count, 6)
     twists[: count // 2] += np.random.default_rng(7).normal(size=(count // 2, 3))  # a rough road before
-    assert len(distinct([Odometry(t, twists)]).t) == MOST_TWISTS
+    assert len(without_repeats([Odometry(t, twists)]).t) == MOST_TWISTS
     found = white(t, twists)
     assert found is not None
     np.testing.assert_allclose(found[0], WHITE, rtol=0.15)

@@ -327,6 +327,7 @@ def test_noise_is_measured_after_8_s_of_driving_and_after_half_as_much_again_eac
         if front_end.noise.measured is not before:
             assert front_end.noise.measured is not None
             on.append(front_end.noise.measured.seconds)
+            np.testing.assert_array_equal(front_end._motion.noise.white, front_end.noise.measured.odometry)
     np.testing.assert_allclose(on, [8.0, 12.0, 18.0], atol=0.5)
 
 
