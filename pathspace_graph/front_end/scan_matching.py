@@ -44,13 +44,12 @@ def merged(line: Detections) -> Detections:
     noise grows with the range, so a sensor that sees three times as far needs hardly more points.
     """
     doublings = np.maximum(np.frexp(np.hypot(*line.points_vehicle.T) / 12.0)[1], 0)
-    cells = np.floor(line.points_vehicle / np.ldexp(1.0, doublings)[:, None]).astype(np.intp)
-    keys = np.column_stack([line.labels, doublings, cells])
-    _, first, cell, counts = np.unique(
-        keys, axis=0, return_index=True, return_inverse=True, return_counts=True
-    )
+    column, row = np.floor(line.points_vehicle.T / np.ldexp(1.0, doublings)).astype(np.intp)
+    # one number for label and cell, as no sensor sees 2^20 cells in a row; unique rows take six times as long
+    keys = (((line.labels << 6) + doublings << 20) + column << 20) + row
+    _, first, cell, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
     columns = [*line.points_vehicle.T, *line.covariances.reshape(-1, 4).T]
-    sums = np.column_stack([np.bincount(cell.ravel(), column, len(counts)) for column in columns])
+    sums = np.column_stack([np.bincount(cell, values, len(counts)) for values in columns])
     means = sums / counts[:, None]
     covariances = means[:, 2:].reshape(-1, 2, 2) / counts[:, None, None]
     return Detections(line.t, means[:, :2], covariances, line.labels[first])
