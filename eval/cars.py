@@ -315,7 +315,7 @@ def real_joint_table(logs: Mapping[str, Log]) -> Table:
     for name, together in joint.drives.items():
         apart = maps_apart(alone[name].map, together.map).statistics()["both"]
         pose = compose(inverse(joint.frames[name]), together.trajectory[-1])
-        end = end_by_registration(seen_cycles(logs[name])[0], logs[name].measured)
+        end = end_by_registration(seen_cycles(logs[name]), logs[name].measured)
         ends = [
             np.nan if end is None else np.hypot(*(of - end)[:2]) for of in (alone[name].trajectory[-1], pose)
         ]

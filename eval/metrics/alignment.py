@@ -21,7 +21,7 @@ from pathspace_graph.factors.se2 import (
     rotated,
     wrap_angle,
 )
-from pathspace_graph.front_end.sightings import SeenCycle, Sightings
+from pathspace_graph.front_end.measurement import SeenCycle, Sightings
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES

@@ -283,7 +283,7 @@ def _end_values(run: RunResult, log: Log) -> dict[str, float]:
     if not has_cones(truth):
         others, values["crossings_own"] = accuracy.crossings(run.map)
         values["crossings"] = others + values["crossings_own"]
-        seen, _ = seen_cycles(log)
+        seen = seen_cycles(log)
         end = end_by_registration(seen, log.measured) if len(poses) else None
         if end is not None:
             for name, pose in (("end", poses[-1]), ("reckoned", seen[-1].pose)):

@@ -15,7 +15,6 @@ from pathspace_graph.errors import InputError, PathspaceError, SettingsError
 from pathspace_graph.front_end.front_end import seen_cycles
 from pathspace_graph.front_end.gate import check_usable
 from pathspace_graph.front_end.noise import measure_noise
-from pathspace_graph.front_end.sightings import TwistRecord
 from pathspace_graph.io.files import check_target
 from pathspace_graph.io.log import LOG_FILE, ODOMETRY_FILE, Log, Odometry
 from pathspace_graph.io.log_files import write_log
@@ -128,10 +127,9 @@ def with_measured_noise(log: Log, parts: int = 1) -> Log:
     if log.odometry_stated and log.detections_stated:
         return log
     settings = MapperSettings(kind=log.sensor.kind)
-    at_one, samples = log.at_scale_one(), TwistRecord()
-    samples.add(Odometry(at_one.odometry.t[::parts], at_one.odometry.twist[::parts]))
-    cycles, _ = seen_cycles(at_one, settings)
-    measured = measure_noise(cycles, samples, of_lines=settings.kind == "line")
+    at_one = log.at_scale_one()
+    samples = Odometry(at_one.odometry.t[::parts], at_one.odometry.twist[::parts])
+    measured = measure_noise(seen_cycles(at_one, settings), samples, of_lines=settings.kind == "line")
     if measured is None:
         return log
     white = measured.odometry * np.sqrt(parts)

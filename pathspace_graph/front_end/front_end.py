@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.copies import Copyable
-from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.arrays import BoolArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.results import RunNoise
@@ -19,12 +19,11 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
 from .log_odometry import LogOdometry, chained
-from .measurement import odometry_noise
+from .measurement import SeenCycle, dead_reckoned
 from .motion import MotionCheck
 from .noise import NoiseLearner, measure_noise
 from .scan_matching import merged
 from .sides import SideJudge
-from .sightings import SeenCycle, TwistRecord
 
 SWAPPED: Final = {  # notices of the cycle in which colours become swapped, or no longer are
     True: "the cones on the left have the colour of the right boundary: the colours are swapped, the track "
@@ -66,14 +65,14 @@ class FrontEnd(Copyable):
 
     def admit(self, odometry: Odometry, detections: Detections) -> Admitted:
         """Return a usable cycle; raise a ReadingError for any other."""
-        return self.gate.admit(odometry, detections, self._motion.newest)
+        return self.gate.admit(odometry, detections, self._motion.t, self._motion.twist)
 
     def update(self, odometry: Odometry, detections: Detections) -> Reading:
         """Check the readings of a cycle: the twists since the previous one, and its detections."""
         noise, check, sides = self.noise, self._motion, self._sides
         cones, orange, in_lane = split_detections(detections, self._settings)
         checked = noise.for_check(cones, odometry.twist[-1] if len(odometry.t) else np.zeros(3))
-        motion = check.update(odometry, checked, "contradict" if noise.is_settled else "agree")
+        motion = check.update(odometry, checked, may_contradict=noise.is_settled)
         swapped, colourless = sides.swapped, sides.colourless
         labels = sides.update(check.pose, motion.twists, checked, in_lane=in_lane).labels
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
@@ -106,11 +105,6 @@ class FrontEnd(Copyable):
     @property
     def noise_used(self) -> RunNoise:
         return self.noise.used(self._settings)
-
-    @property
-    def pose(self) -> Array:
-        """Copy of the newest pose (3,) by odometry alone."""
-        return self._motion.pose.copy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,22 +153,17 @@ def is_orange(detections: Detections) -> BoolArray:
 def measure_log(log: Log, settings: MapperSettings | None = None) -> MeasuredNoise | None:
     """Measure the noise of a whole log and the constant errors of its sensor from its readings alone."""
     settings = settings or MapperSettings()
-    return measure_noise(*seen_cycles(log, settings), of_lines=settings.of_lines)
+    return measure_noise(seen_cycles(log, settings), log.odometry, of_lines=settings.of_lines)
 
 
-def seen_cycles(log: Log, settings: MapperSettings | None = None) -> tuple[list[SeenCycle], TwistRecord]:
-    """Return the detections of a log with poses by odometry alone, and its twists; odometry is trusted."""
+def seen_cycles(log: Log, settings: MapperSettings | None = None) -> list[SeenCycle]:
+    """Return the detections of a log with poses by odometry alone, which is trusted."""
     settings = settings or MapperSettings()
-    readings, twists, cycles = list(split_odometry(log)), TwistRecord(), []
-    for odometry, _ in readings:
-        twists.add(odometry)
-    white = odometry_noise(twists, None)
-    noise = log.noise.twist if white is None else white.twist
-    check = MotionCheck(noise, settings.motion, of_lines=settings.of_lines)
-    sides = SideJudge(settings.sides)
-    for odometry, detections in readings:
+    sides, cycles = SideJudge(settings.sides), []
+    poses = dead_reckoned(log.odometry, np.array([cycle.t for cycle in log.cycles]))
+    for pose, (odometry, detections) in zip(poses, split_odometry(log), strict=True):
         cones, _, in_lane = split_detections(detections, settings)
-        motion = check.update(odometry, cones, "bridge")
-        labelled = sides.update(check.pose, motion.twists, cones, in_lane=in_lane)
-        cycles.append(SeenCycle(labelled, check.pose, motion.odometry.twist))
-    return cycles, twists
+        labelled = sides.update(pose, odometry.twist, cones, in_lane=in_lane)
+        twist = odometry.twist[-1] if len(odometry.t) else np.zeros(3)
+        cycles.append(SeenCycle(labelled, pose, twist))
+    return cycles

@@ -6,7 +6,7 @@ where the ray meets the line steeply, across the ray where it runs beside the li
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -20,64 +20,31 @@ from pathspace_graph.mapping.tracks import RECKONED
 
 from .measurement import (
     BINS,
+    FIRST_ACROSS,
+    FIRST_ALONG,
     LEAST_NOISE,
     MIN_ROWS,
+    MIN_SPEED_SHARE,
     NEAR_SHARE,
     NOISE_HUBER,
     PRIOR,
     Rays,
+    SeenCycle,
+    Sightings,
     clustered,
     derivatives_by_constants,
     line_through,
     runs,
     with_detections,
 )
-from .sightings import (
-    FIRST_ACROSS,
-    FIRST_ALONG,
-    MIN_SPEED_SHARE,
-    SeenCycle,
-    Sightings,
-)
 
 CELL: Final = 4.0  # side of the cells (m) in which a line is a parabola; small ones cut off large errors
-MOST_POINTS: Final = 4000  # points that are measured on, which bounds the time of a round
-FEWEST: Final = 8  # points of a line in a cell
 SHAPE: Final = np.array([0.0, 0.25, 10.0])
 """Inverse variances of a weak prior of the parabola `q0 + q1 s + q2 s^2`: sigmas of 2 and of 0.3/m."""
-ROUNDS_FIRST: Final = 8  # times that cells, errors, noise and weights are found in turn
-ROUNDS_AGAIN: Final = 3  # the same, from what was found before
-STEPS: Final = 4  # fits of a round, by the slopes and weights of the one before
-CLIPPED: Final = 9.0  # largest whitened square that counts for the noise
-
-
-@dataclass(frozen=True, eq=False)
-class LineFit:
-    """Parabolas through the points of each cell, and what is left of the points across them."""
-
-    table: Sightings  # sorted by cell, then by time
-    begins: IntArray  # (c,) row of each cell's first point
-    counts: IntArray  # (c,) number of its points
-    shares: Array  # (2, n) of the directions along and across the ray in the normal, squared
-    ranges: Array  # (n,) m
-    drift: Array  # (2, n) variances of the odometry along and across the ray since the cell's mean (m^2)
-    off: Array  # (n,) from the parabola (m)
-    leverage: Array  # (n,) share of each point in the parabola there
-    errors: Array  # (7,) constants, see `measurement:PRIOR`
-    covariance: Array  # (7, 7) of these, if noise is white
-    clustered: Array  # (7, 7) by how much the cells disagree
-
-
-def sightings_of(cycles: Sequence[SeenCycle]) -> Sightings:
-    """Points of lines that were seen in motion, in order of time, with their labels for cells."""
-    table = Sightings.of(cycles)
-    least = MIN_SPEED_SHARE * np.median([np.hypot(*one.twist[:2]) for one in cycles])
-    table = table.where(np.hypot(*table.twist[:, :2].T) > least)
-    return table.where(slice(None, None, max(-(-len(table.t) // MOST_POINTS), 1)))
 
 
 def in_cells(table: Sightings, errors: Array) -> tuple[Sightings, IntArray, IntArray]:
-    """Return the points in cells that were seen from near and far, and first row and size (c,) of the cells.
+    """Return the points in cells with eight at least from near and far, and first row and size (c,) of these.
 
     Constant errors (7,) are undone. A cell that is seen again later is another one.
     """
@@ -94,15 +61,21 @@ def in_cells(table: Sightings, errors: Array) -> tuple[Sightings, IntArray, IntA
     ranges = np.hypot(*table.point[order].T)
     begins, counts = runs(number)
     nearest, farthest = np.minimum.reduceat(ranges, begins), np.maximum.reduceat(ranges, begins)
-    chosen = ((counts >= FEWEST) & (nearest < NEAR_SHARE * farthest))[number]
+    chosen = ((counts >= 8) & (nearest < NEAR_SHARE * farthest))[number]
     table = replace(table.where(order[chosen]), cone=number[chosen])
     return table, *runs(table.cone)
 
 
-def fit(table: Sightings, errors: Array, noise: Rays, walk: Array) -> LineFit | None:
-    """Return parabolas and constants by least squares; None where too few points tell them.
+def fit(
+    table: Sightings, errors: Array, noise: Rays, walk: Array
+) -> tuple[Sightings, IntArray, Array, Array, Rays] | None:
+    """Fit parabolas and constants by least squares, and the noise that is left across the parabolas.
 
-    The odometry walks (3,) by m, m and rad in the root of a second.
+    The odometry walks (3,) by m, m and rad in the root of a second. Returned are the points in cells, the
+    number (c,) in each cell, the constants (7,) of `measurement:PRIOR`, their standard deviations, and the
+    noise along and across the ray by range; None if too few points determine them. The square of what is left
+    has the expectation `(1 - leverage) sum_k share_k (a_k^2 + b_k^2 r^2)`, which is linear in the squares of
+    the noise: the shares are those of the directions along and across the ray in the normal, squared.
     """
     table, begins, counts = in_cells(table, errors)
     if len(table.t) < MIN_ROWS:
@@ -116,7 +89,7 @@ def fit(table: Sightings, errors: Array, noise: Rays, walk: Array) -> LineFit | 
     tangents, s, y = _frames(points, 1.0 / variances.sum(axis=0), begins, counts)
     basis = np.stack([np.ones(len(s)), s, s**2], axis=1)
     slopes, weights, cell = np.zeros(len(s)), np.ones(len(s)), np.repeat(np.arange(len(counts)), counts)
-    for _ in range(STEPS):
+    for _ in range(4):  # with the slopes and weights of the step before
         normals = left_of(tangents) - slopes[:, None] * tangents
         shares = np.array([(normals * axis).sum(axis=1) ** 2 for axis in axes])
         variance = (shares * variances).sum(axis=0)
@@ -139,7 +112,16 @@ def fit(table: Sightings, errors: Array, noise: Rays, walk: Array) -> LineFit | 
     leverage = weight * np.einsum("nk,nkl,nl->n", basis, inverse[cell], basis)
     middle = np.add.reduceat(table.t, begins) / counts
     spread = clustered(middle, scores, covariance)
-    return LineFit(table, begins, counts, shares, ranges, drift, off, leverage, found, covariance, spread)
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), np.diag(spread)))
+    slow, room = (shares * drift).sum(axis=0), np.maximum(1.0 - leverage, 0.1)
+    square = np.minimum(off**2 / (room * variance), 9.0) - slow / variance  # few outliers count for the noise
+    model = np.concatenate([shares, shares * ranges**2]).T
+    squares = scipy.optimize.nnls(model / variance[:, None], square)[0].reshape(2, 2).T
+    middle = np.quantile(ranges, (np.arange(BINS) + 0.5) / BINS)
+    lines = [line_through(middle, np.sqrt(np.maximum(a + b * middle**2, 1e-8))) for a, b in squares]
+    along = RayNoise(np.maximum(lines[0], (LEAST_NOISE[0], 0.0)))
+    across = RayNoise(np.maximum(lines[1], (0.0, LEAST_NOISE[1])))
+    return table, counts, found, sigmas, (along, across)
 
 
 def _frames(points: Array, weight: Array, begins: IntArray, counts: IntArray) -> tuple[Array, Array, Array]:
@@ -157,49 +139,34 @@ def _frames(points: Array, weight: Array, begins: IntArray, counts: IntArray) ->
     return tangents, (off * tangents).sum(axis=1), (off * left_of(tangents)).sum(axis=1)
 
 
-def noise_of(found: LineFit, noise: Rays) -> Rays:
-    """Return the noise along and across the ray by range, by what is left across the parabolas.
-
-    Its expectation is `(1 - leverage) sum_k share_k (a_k^2 + b_k^2 r^2)`, which is linear in the squares.
-    """
-    ranges, shares = found.ranges, found.shares
-    model = np.concatenate([shares, shares * ranges**2]).T
-    drift = (shares * found.drift).sum(axis=0)
-    variance = drift + (shares * [one.sigmas(ranges) ** 2 for one in noise]).sum(axis=0)
-    room = np.maximum(1.0 - found.leverage, 0.1)
-    square = np.minimum(found.off**2 / (room * variance), CLIPPED) - drift / variance
-    squares = scipy.optimize.nnls(model / variance[:, None], square)[0].reshape(2, 2).T
-    middle = np.quantile(ranges, (np.arange(BINS) + 0.5) / BINS)
-    lines = [line_through(middle, np.sqrt(np.maximum(a + b * middle**2, 1e-8))) for a, b in squares]
-    least = (LEAST_NOISE[0], 0.0), (0.0, LEAST_NOISE[1])
-    along, across = (RayNoise(np.maximum(line, low)) for line, low in zip(lines, least, strict=True))
-    return along, across
-
-
 class LineMeasurement(Copyable):
     """Measurement of noise by points of lines, in steps short enough for a perception cycle."""
 
     def __init__(self, cycles: Sequence[SeenCycle], found: MeasuredNoise) -> None:
-        """Begin with the cycles of a drive, and with what is known: the noise of the odometry at least."""
-        self._found, self._points = found, sightings_of(cycles)
-        self._errors, self._rounds = np.zeros(len(PRIOR)), ROUNDS_FIRST
-        self._noise = found.along or FIRST_ALONG, found.across or FIRST_ACROSS
-        if found.along is not None:
-            self._rounds = ROUNDS_AGAIN
-            self._errors = np.array([*found.sensor, found.range_bend, 0.0])
+        """Begin with the cycles of a drive, and with what is known: the noise of the odometry at least.
+
+        Points count if they were seen in motion, up to a number that bounds the time of a round.
+        """
+        table = Sightings.of(cycles)
+        least = MIN_SPEED_SHARE * np.median([np.hypot(*one.twist[:2]) for one in cycles])
+        table = table.where(np.hypot(*table.twist[:, :2].T) > least)
+        self._points = table.where(slice(None, None, max(-(-len(table.t) // 4000), 1)))
+        self._found, self._noise = found, (found.along or FIRST_ALONG, found.across or FIRST_ACROSS)
+        self._errors, self._rounds = np.zeros(len(PRIOR)), 8
+        if found.along is not None:  # nearly converged
+            self._errors, self._rounds = np.array([*found.sensor, found.range_bend, 0.0]), 3
 
     def advance(self) -> MeasuredNoise | None:
-        """Make the next round; return what was found if it is the last one."""
+        """Find cells, errors, noise and weights in turn; return what was found in the last round."""
         walk = self._found.odometry * np.sqrt(self._found.interval)
         found = fit(self._points, self._errors, self._noise, walk)
         if found is None:
             return self._found
-        self._errors, self._noise = found.errors, noise_of(found, self._noise)
+        table, counts, self._errors, sigmas, self._noise = found
         self._rounds -= 1
         if self._rounds:
             return None
-        sigmas = np.sqrt(np.maximum(np.diag(found.covariance), np.diag(found.clustered)))
         stamps = np.unique(self._points.t)
-        count, period = int(np.median(found.counts)), float(np.median(np.diff(stamps)))
-        counts = count, period, len(self._points.t) / len(stamps)
-        return with_detections(self._found, self._noise, self._errors, sigmas, found.table.t, counts)
+        period, per_cycle = float(np.median(np.diff(stamps))), len(self._points.t) / len(stamps)
+        seen = int(np.median(counts)), period, per_cycle
+        return with_detections(self._found, self._noise, self._errors, sigmas, table.t, seen)

@@ -6,35 +6,127 @@ derivatives, white noise scatters them, and correlated errors shift the sighting
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Self
+from dataclasses import dataclass, fields, replace
+from math import comb
+from typing import Final
 
 import numpy as np
 
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors import _kernels as kernels
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import (
-    ASSUMED_DRIFT,
     SURE,
     MeasuredNoise,
     RayNoise,
     huber_weights,
     ray_axes,
 )
-from pathspace_graph.factors.se2 import in_vehicle, rotations, to_map
+from pathspace_graph.factors.se2 import compose, in_vehicle, left_of, rotated, rotations, se2_exp, to_map
 from pathspace_graph.factors.sensor import BENDS_FROM, SENSOR_SIZE
+from pathspace_graph.io.log import Detections, Odometry
+from pathspace_graph.mapping.tracks import Tracks
 
-from .sightings import (
-    FIRST_ACROSS,
-    FIRST_ALONG,
-    FOLLOW_RANGE,
-    MAD,
-    MIN_SPEED_SHARE,
-    SeenCycle,
-    Sightings,
-    TwistRecord,
-)
+# --- twists ----------------------------------------------------------------------------------------------
+
+MAD: Final = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
+MOST_TWISTS: Final = 4000  # largest number of newest twists
+MIN_SPEED_SHARE: Final = 0.3  # least share of the median speed for the noise in motion
+MIN_TWISTS: Final = 30  # least number of twists for white noise
+
+
+def dead_reckoned(odometry: Odometry, stamps: Array) -> Array:
+    """Poses (n, 3) at stamps (n,) in s by odometry alone, from the origin at its first row."""
+    row = np.maximum(odometry.t.searchsorted(stamps, side="right") - 1, 0)
+    held = np.maximum(stamps - odometry.t[row], 0.0)
+    return compose(odometry.poses()[row], se2_exp(odometry.twist[row] * held[:, None]))
+
+
+def without_repeats(parts: Sequence[Odometry]) -> Odometry:
+    """Join odometry without repeated twists, which are held, up to a number of newest ones."""
+    t = np.concatenate([np.zeros(0), *(part.t for part in parts)])
+    twists = np.concatenate([np.zeros((0, 3)), *(part.twist for part in parts)])
+    new = np.ones(len(t), bool)
+    new[1:] = (np.diff(t) > 0.0) & (np.diff(twists, axis=0) != 0.0).any(axis=1)
+    return Odometry(t[new][-MOST_TWISTS:], twists[new][-MOST_TWISTS:])
+
+
+def twist_noise(odometry: Odometry) -> tuple[Array, float] | None:
+    """Return the noise (k, 3) of a twist by differences of second to fourth order, and their interval (s).
+
+    The noise by order k is the scaled median absolute difference over `sqrt(binomial(2 k, k))`. The least is
+    the white noise; it is not white if orders disagree. None for too few twists.
+    """
+    odometry = without_repeats([odometry])
+    twists, orders = odometry.twist, list[Array]()
+    if len(twists) < MIN_TWISTS:
+        return None
+    speeds = np.hypot(twists[:, 0], twists[:, 1])
+    drives = speeds > MIN_SPEED_SHARE * np.median(speeds)
+    for k in (2, 3, 4):
+        inside = np.lib.stride_tricks.sliding_window_view(drives, k + 1).all(axis=1)
+        if inside.sum() >= MIN_TWISTS // 2:
+            differences = np.abs(np.diff(twists, k, axis=0)[inside])
+            orders.append(MAD * np.median(differences, axis=0) / np.sqrt(comb(2 * k, k)))
+    return (np.array(orders), float(np.median(np.diff(odometry.t)))) if orders else None
+
+
+# --- sightings of cones ----------------------------------------------------------------------------------
+
+FOLLOW_RANGE: Final = 30.0  # largest range of a tracked cone (m): few cones beyond are seen from near later
+GATE_LEAST: Final = 0.4  # distance within which a sighting is of a cone (m)
+GATE_MOST: Final = 3.0  # largest such distance (m); a narrow gate would cut off the noise
+FIRST_ALONG: Final = RayNoise(np.array([0.1, 0.04]))  # initial noise along the ray
+FIRST_ACROSS: Final = RayNoise(np.array([0.05, 0.016]))  # and across it
+
+
+@dataclass(frozen=True, eq=False)
+class SeenCycle:
+    """A perception cycle with its pose by dead reckoning."""
+
+    detections: Detections  # detections as measured
+    pose: Array  # (3,) pose by dead reckoning
+    twist: Array  # (3,) twist of the vehicle (m/s, m/s, rad/s)
+
+
+@dataclass(eq=False)
+class Sightings:
+    """Table of detections of static cones or points, in order of time."""
+
+    cone: IntArray  # (n,) number of the cone, or the label while cones are unknown
+    t: Array  # (n,) stamp (s)
+    point: Array  # (n, 2) measured point in m, vehicle frame
+    twist: Array  # (n, 3) twist of the vehicle (m/s, m/s, rad/s)
+    pose: Array  # (n, 3) pose by dead reckoning
+    by_bias: Array  # (n, 3) derivative of the pose by the bias of the yaw rate
+
+    @classmethod
+    def of(cls, cycles: Sequence[SeenCycle]) -> "Sightings":
+        """Return the detections of cycles up to `FOLLOW_RANGE`, with labels for cones."""
+        poses, twists = np.array([one.pose for one in cycles]), np.array([one.twist for one in cycles])
+        seen = [one.detections for one in cycles]
+        t, points = np.array([one.t for one in seen]), np.concatenate([one.points_vehicle for one in seen])
+        labels, moved = np.concatenate([one.labels for one in seen]), np.diff(poses[:, :2], axis=0)
+        turned, own = t[0] - t, np.repeat(np.arange(len(seen)), [len(one.labels) for one in seen])
+        middle = turned[1:] + 0.5 * np.diff(t)
+        shift = np.concatenate([np.zeros((1, 2)), np.cumsum(left_of(moved) * middle[:, None], axis=0)])
+        table = cls(labels, t[own], points, twists[own], poses[own], np.column_stack([shift, turned])[own])
+        return table.where(np.hypot(*points.T) < FOLLOW_RANGE)
+
+    def where(self, rows: IntArray | BoolArray | slice) -> "Sightings":
+        return Sightings(*(getattr(self, column.name)[rows] for column in fields(self)))
+
+    def tracked(self, noise: MeasuredNoise) -> "Sightings":
+        """Replace the labels by numbers of cones, which are tracked by dead reckoning."""
+        rays = replace(noise, along=noise.along or FIRST_ALONG, across=noise.across or FIRST_ACROSS)
+        covariances = rays.covariances(self.point, inflated=False)
+        assert covariances is not None
+        points = to_map(noise.corrected(self.point, self.twist), self.pose)
+        cones = Tracks(GATE_LEAST, most=GATE_MOST / GATE_LEAST, sigmas=3.5)
+        return replace(self, cone=cones.add(points, rotated(covariances, self.pose[:, 2]), self.cone, self.t))
+
+
+# --- constants and noise of a sensor of cones --------------------------------------------------------------
 
 PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02, 0.02])
 """Prior standard deviations of the constants: errors of the sensor (rad, m, s, -, m), bend of its ranges
@@ -44,25 +136,17 @@ PASSES: Final = 4  # passes over the cycles, each of which tracks the cones agai
 ROUNDS_FIRST: Final = 5  # alternations of errors, noise and weights in a pass
 ROUNDS_AGAIN: Final = 3  # alternations in a pass that starts from measured noise, nearly converged
 CLUSTER_TIME: Final = 3.0  # time (s) over which errors of the odometry are correlated
-COUNTED: Final = 0.8  # share of `FOLLOW_RANGE` beyond which only underestimated ranges are in reach
-HARDLY: Final = 1e-6  # weight of sightings beyond it, so that a cone seen only there has a position
 NOISE_HUBER: Final = 2.0  # threshold of Huber's loss (sigmas)
-MIN_COUNT: Final = 5  # least number of sightings of a cone in use
 MIN_ROWS: Final = 60  # least number of sightings with a reference from which noise is estimated
 NEAR_SHARE: Final = 0.6  # references of a sighting: sightings of its cone within this share of its range
-NEAR_TIME: Final = 6.0  # longest time to a reference (s), over which odometry is trusted
 BINS: Final = 8  # largest number of range bins
 STAY_TIMES: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # candidate correlation times (s)
 LAGS: Final = (0.05, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)  # edges of the lag bins of the correlation (s)
 MODEL_ERROR: Final = 0.05  # relative error of the linear model, one sigma
-FIRST_SHARE: Final = 0.5  # prior share of the variance that is correlated
-FIRST_CONES: Final = 8.0  # weight of `FIRST_SHARE`, in cones
 LEAST_NOISE: Final = (0.02, 0.002)  # least noise along the ray (m) and across it (rad): cones have a size
 
 Rays = tuple[RayNoise, RayNoise]
 """Noise along the ray and across it."""
-Lagged = tuple[IntArray, IntArray, Array, IntArray]
-"""Pairs of sightings of one cone, by index, with their lags (s) and bins in `LAGS`."""
 
 
 @dataclass(eq=False)
@@ -74,17 +158,8 @@ class _Cones:
     counts: IntArray  # (c,) number of its sightings
     axes: Array  # (2, n, 2) unit vectors along the ray and across it, map frame
     points: Array  # (n, 2) sightings p in m, map frame by dead reckoning
-    ranges: Array  # (n,) measured range of the cone, without noise once `without` has run (m)
+    ranges: Array  # (n,) measured range of the cone, without noise from the second round on (m)
     columns: Array  # (n, 2, 7) derivatives A by the constants (`PRIOR`)
-
-    def without(self, off: Array) -> Self:
-        """Return the sightings with ranges and derivatives at positions without their noise `off` (n, 2).
-
-        Noisy ranges would bias the weights towards short sightings and shrink the estimated errors.
-        """
-        seen = self.table.point - in_vehicle(off, self.table.pose)
-        columns = derivatives_by_constants(self.table, np.repeat(self.begins, self.counts), seen)
-        return replace(self, ranges=np.hypot(*seen.T), columns=columns)
 
     def on_axes(self, off: Array, rows: IntArray | slice = slice(None)) -> Array:
         """Return the components (2, k) of offsets (k, 2), map frame, along and across the rays of `rows`."""
@@ -94,18 +169,14 @@ class _Cones:
         """Return the standard deviations (2, n) of the sightings along and across their rays, in m."""
         return np.array([one.sigmas(self.ranges) for one in noise])
 
-    def information(self, noise: Rays, weights: Array) -> Array:
-        by_ray, by_side = self.axes[:, :, :, None] * self.axes[:, :, None, :]
-        along, across = (weights / self.sigmas(noise) ** 2)[:, :, None, None]
-        return np.asarray(along * by_ray + across * by_side)
-
 
 def _cones(sightings: Sightings) -> _Cones | None:
+    """Return the cones seen at least five times in motion, or None if they are too few."""
     speed = np.hypot(sightings.twist[:, 0], sightings.twist[:, 1])
     moving = speed > MIN_SPEED_SHARE * np.median(speed) if len(speed) else np.zeros(0, bool)
     count = np.bincount(sightings.cone[moving]) if moving.any() else np.zeros(1, np.intp)
     chosen = np.flatnonzero(moving)
-    chosen = chosen[count[sightings.cone[chosen]] >= MIN_COUNT]
+    chosen = chosen[count[sightings.cone[chosen]] >= 5]
     if len(chosen) < MIN_ROWS:
         return None
     table = sightings.where(chosen[np.argsort(sightings.cone[chosen], kind="stable")])
@@ -130,19 +201,6 @@ def runs(groups: IntArray) -> tuple[IntArray, IntArray]:
     return begins, np.diff(np.append(begins, len(groups)))
 
 
-def _solve(cones: _Cones, information: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the constants b (7,), two covariances (7, 7), and the residuals (n, 2) of the sightings.
-
-    The cones' positions, weighted means of `p + A b`, are eliminated. The second covariance is `clustered`.
-    """
-    columns, points, own, vectors = kernels.centred(cones.begins, information, cones.columns, cones.points)
-    covariance = np.asarray(np.linalg.inv(own.sum(axis=0) + np.diag(PRIOR**-2)), np.float64)
-    errors = -covariance @ vectors.sum(axis=0)
-    scores = vectors + own @ errors
-    middle = np.add.reduceat(cones.table.t, cones.begins) / cones.counts
-    return errors, covariance, clustered(middle, scores, covariance), points + columns @ errors
-
-
 def clustered(middle: Array, scores: Array, covariance: Array) -> Array:
     """Return the cluster-robust covariance `P (sum g g') P` (7, 7) of the constants (White's estimator).
 
@@ -156,45 +214,6 @@ def clustered(middle: Array, scores: Array, covariance: Array) -> Array:
     return np.asarray(covariance @ (summed.T @ summed) @ covariance * count / max(count - 1, 1))
 
 
-def _residuals(cones: _Cones, errors: Array, noise: Rays, odometry: Array) -> tuple[IntArray, Array, Array]:
-    """Return the rows (k,) of sightings that have nearer references, and their offsets from these.
-
-    The offsets (2, k) along and across the ray (m) are corrected for the constant errors. The variances
-    (2, k) of references and odometry (m^2) follow. `odometry` (3,) is its random walk (m, m, rad / sqrt(s)).
-    """
-    points, sigmas = cones.points + cones.columns @ errors, cones.sigmas(noise)
-    weight = 1.0 / (sigmas**2).mean(axis=0)
-    values, table = np.column_stack([points, *sigmas]), cones.table
-    sought = NEAR_SHARE, NEAR_TIME
-    rows, counts, means = kernels.references(table.cone, table.t, cones.ranges, weight, values, sought)
-    offsets, lag = cones.on_axes(points[rows] - means[:, 1:3], rows), means[:, 0]
-    across = odometry[1] ** 2 + (odometry[2] * cones.ranges[rows]) ** 2
-    known = np.array([odometry[0] ** 2 * lag, across * lag])
-    for axis, one in enumerate(noise):
-        known[axis] += means[:, 3 + axis] ** 2 * np.maximum(1.0 / counts, one.share)
-    return rows, offsets, known
-
-
-def _ray_noise(
-    cones: _Cones, rows: IntArray, lagged: Lagged, off: Array, reference: Array, least: tuple[float, float]
-) -> RayNoise:
-    """Return the noise along or across the ray by range, with its correlation, from `_residuals` (k,)."""
-    ranges = cones.ranges[rows]
-    order, bins = np.argsort(ranges), np.arange(max(min(BINS, len(rows) // (MIN_ROWS // 2)), 2))
-    counts = len(rows) // len(bins) + (bins < len(rows) % len(bins))  # bins of equal count, by range
-    begins, size = counts.cumsum() - counts, np.abs(off[order])
-    middle, known = (np.add.reduceat(of[order], begins) / counts for of in (ranges, reference))
-    size = size[np.lexsort((size, np.repeat(bins, counts)))]
-    medians = 0.5 * (size[begins + (counts - 1) // 2] + size[begins + counts // 2])
-    scatter = (MAD * medians) ** 2
-    sigma = np.sqrt(np.clip(scatter - known, 0.25 * scatter, 4.0 * scatter))
-    found = RayNoise(np.maximum(line_through(middle, sigma), least))
-    share, time = _staying(lagged, off, reference, found.sigmas(ranges))
-    count = len(np.unique(cones.table.cone[rows]))
-    share = (count * share + FIRST_CONES * FIRST_SHARE) / (count + FIRST_CONES)
-    return replace(found, share=share, time=time)
-
-
 def line_through(ranges: Array, sigma: Array) -> Array:
     """Minimize `sum ((a + b r) / sigma - 1)^2` over `a, b >= 0` for sigmas (k,) at ranges r (k,)."""
     columns = np.stack([np.ones(len(ranges)), ranges], axis=1) / sigma[:, None]
@@ -206,22 +225,11 @@ def line_through(ranges: Array, sigma: Array) -> Array:
     return np.asarray(share * (np.arange(2) == best))
 
 
-def _lagged(cone: IntArray, t: Array) -> Lagged:
-    """Return the ordered pairs of sightings (k,), sorted by cone, of one cone with a lag within `LAGS`."""
-    begins, counts = runs(cone)
-    repeats = np.repeat(counts, counts)
-    i = np.repeat(np.arange(len(cone)), repeats)
-    nth = np.arange(len(i)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
-    j = np.repeat(np.repeat(begins, counts), repeats) + nth
-    lag = t[j] - t[i]
-    inside = (lag >= LAGS[0]) & (lag < LAGS[-1])
-    return i[inside], j[inside], lag[inside], np.digitize(lag[inside], LAGS)
-
-
-def _staying(lagged: Lagged, off: Array, reference: Array, sigma: Array) -> tuple[float, float]:
+def _staying(
+    i: IntArray, j: IntArray, lag: Array, place: IntArray, off: Array, reference: Array, sigma: Array
+) -> tuple[float, float]:
     """Return share of the variance and correlation time (s) of the correlated part of errors `off` (k,)."""
     whitened, own = np.clip(off / sigma, -3.0, 3.0), reference / sigma**2
-    i, j, lag, place = lagged
     product = whitened[i] * whitened[j] - 0.5 * (own[i] + own[j])
     scale = max(float((whitened**2 - own).mean()), 0.25)
     counts = np.bincount(place, minlength=len(LAGS))
@@ -236,6 +244,52 @@ def _staying(lagged: Lagged, off: Array, reference: Array, sigma: Array) -> tupl
     shares = np.clip((weights * model) @ correlations / (weights * model**2).sum(axis=1), 0.0, 1.0)
     best = int((weights * (correlations - shares[:, None] * model) ** 2).sum(axis=1).argmin())
     return float(shares[best]), STAY_TIMES[best]
+
+
+def _noise_by_range(cones: _Cones, errors: Array, noise: Rays, odometry: Array) -> Rays | None:
+    """Return the noise along and across the ray by range, with its correlation; None for too few sightings.
+
+    Sightings are compared with nearer ones of their cone, which are within 0.6 of their range and 6 s, over
+    which odometry is trusted. The offsets (2, k) are corrected for the constant errors (7,), and have the
+    variances of these references and of the odometry, a random walk (3,) (m, m, rad / sqrt(s)), as well.
+    """
+    points, sigmas, table = cones.points + cones.columns @ errors, cones.sigmas(noise), cones.table
+    weight, values = 1.0 / (sigmas**2).mean(axis=0), np.column_stack([points, *sigmas])
+    sought = NEAR_SHARE, 6.0
+    rows, references, means = kernels.references(table.cone, table.t, cones.ranges, weight, values, sought)
+    if len(rows) < MIN_ROWS:
+        return None
+    ranges, offsets = cones.ranges[rows], cones.on_axes(points[rows] - means[:, 1:3], rows)
+    across = odometry[1] ** 2 + (odometry[2] * ranges) ** 2
+    known = np.array([odometry[0] ** 2 * means[:, 0], across * means[:, 0]])
+    for axis, one in enumerate(noise):
+        known[axis] += means[:, 3 + axis] ** 2 * np.maximum(1.0 / references, one.share)
+    # ordered pairs of sightings i, j of one cone with a lag within `LAGS`; they are sorted by cone
+    firsts, sizes = runs(table.cone[rows])
+    repeats = np.repeat(sizes, sizes)
+    i = np.repeat(np.arange(len(rows)), repeats)
+    nth = np.arange(len(i)) - np.repeat(np.cumsum(repeats) - repeats, repeats)
+    j = np.repeat(np.repeat(firsts, sizes), repeats) + nth
+    lag = table.t[rows][j] - table.t[rows][i]
+    inside = (lag >= LAGS[0]) & (lag < LAGS[-1])
+    pairs = i[inside], j[inside], lag[inside], np.digitize(lag[inside], LAGS)
+    order, bins = np.argsort(ranges), np.arange(max(min(BINS, len(rows) // (MIN_ROWS // 2)), 2))
+    counts = len(rows) // len(bins) + (bins < len(rows) % len(bins))  # bins of equal count, by range
+    begins, found = counts.cumsum() - counts, list[RayNoise]()
+    middle = np.add.reduceat(ranges[order], begins) / counts
+    floors = (LEAST_NOISE[0], 0.0), (0.0, LEAST_NOISE[1])
+    for off, variance, least in zip(offsets, known, floors, strict=True):
+        size = np.abs(off[order])
+        size = size[np.lexsort((size, np.repeat(bins, counts)))]
+        medians = 0.5 * (size[begins + (counts - 1) // 2] + size[begins + counts // 2])
+        scatter = (MAD * medians) ** 2
+        variances = scatter - np.add.reduceat(variance[order], begins) / counts
+        sigma = np.sqrt(np.clip(variances, 0.25 * scatter, 4.0 * scatter))
+        line = RayNoise(np.maximum(line_through(middle, sigma), least))
+        share, time = _staying(*pairs, off, variance, line.sigmas(ranges))
+        share = (len(sizes) * share + 8.0 * 0.5) / (len(sizes) + 8.0)  # a prior of half, worth eight cones
+        found.append(replace(line, share=share, time=time))
+    return found[0], found[1]
 
 
 class Measurement(Copyable):
@@ -263,48 +317,49 @@ class Measurement(Copyable):
         return None
 
     def _round(self, cones: _Cones) -> MeasuredNoise | None:
-        walk, noise = self._found.odometry * np.sqrt(self._found.interval), self._noise
-        errors, *covariances, off = _solve(cones, cones.information(noise, self._weights))
-        cones = self._cones = cones.without(off)
-        self._weights = huber_weights(np.hypot(*(cones.on_axes(off) / cones.sigmas(noise))), NOISE_HUBER) ** 2
-        self._weights[cones.ranges > COUNTED * FOLLOW_RANGE] = HARDLY
-        rows, (along, across), (by_along, by_across) = _residuals(cones, errors, noise, walk)
-        if len(rows) < MIN_ROWS:
-            return self._passed(self._found)
-        lagged = _lagged(cones.table.cone[rows], cones.table.t[rows])
-        self._noise = (
-            _ray_noise(cones, rows, lagged, along, by_along, (LEAST_NOISE[0], 0.0)),
-            _ray_noise(cones, rows, lagged, across, by_across, (0.0, LEAST_NOISE[1])),
-        )
-        self._rounds -= 1
-        return None if self._rounds else self._passed(self._result(cones, errors, *covariances))
+        """Find the constants b (7,) by least squares, then noise and weights; the result of the last round.
 
-    def _result(self, cones: _Cones, errors: Array, covariance: Array, clustered: Array) -> MeasuredNoise:
-        """Return the measured noise, with the constants (7,) and both of their covariances (7, 7).
-
-        The constant part of a cone's error shifts its position; only the rest biases the constants.
+        The cones' positions, weighted means of `p + A b`, are eliminated. Ranges and derivatives are those at
+        positions without noise from then on: noisy ranges would bias the weights towards short sightings and
+        shrink the estimated errors.
         """
+        walk, noise, table = self._found.odometry * np.sqrt(self._found.interval), self._noise, cones.table
+        by_ray, by_side = cones.axes[:, :, :, None] * cones.axes[:, :, None, :]
+        along, across = (self._weights / cones.sigmas(noise) ** 2)[:, :, None, None]
+        information = along * by_ray + across * by_side
+        columns, points, own, vectors = kernels.centred(
+            cones.begins, information, cones.columns, cones.points
+        )
+        covariance = np.asarray(np.linalg.inv(own.sum(axis=0) + np.diag(PRIOR**-2)), np.float64)
+        errors = -covariance @ vectors.sum(axis=0)
+        middle = np.add.reduceat(table.t, cones.begins) / cones.counts
+        spread, off = clustered(middle, vectors + own @ errors, covariance), points + columns @ errors
+        seen = table.point - in_vehicle(off, table.pose)
+        columns = derivatives_by_constants(table, np.repeat(cones.begins, cones.counts), seen)
+        cones = self._cones = replace(cones, ranges=np.hypot(*seen.T), columns=columns)
+        self._weights = huber_weights(np.hypot(*(cones.on_axes(off) / cones.sigmas(noise))), NOISE_HUBER) ** 2
+        # beyond, only underestimated ranges are in reach; a cone seen only there still has a position
+        self._weights[cones.ranges > 0.8 * FOLLOW_RANGE] = 1e-6
+        found = _noise_by_range(cones, errors, noise, walk)
+        if found is None:
+            return self._passed(self._found)
+        self._noise, self._rounds = found, self._rounds - 1
+        if self._rounds:
+            return None
         stamps = np.unique(self._sightings.t)
         counts = int(np.median(cones.counts)), float(np.median(np.diff(stamps)))
-        stays = max(one.inflation_of_slope(*counts) for one in self._noise)
-        sigmas = np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(clustered)))
+        # the constant part of a cone's error shifts its position; only the rest biases the constants
+        stays = max(one.inflation_of_slope(*counts) for one in found)
+        sigmas = np.sqrt(np.maximum(stays * np.diag(covariance), np.diag(spread)))
         per_cycle = len(self._sightings.t) / len(stamps)
-        return with_detections(self._found, self._noise, errors, sigmas, cones.table.t, (*counts, per_cycle))
+        return self._passed(
+            with_detections(self._found, found, errors, sigmas, table.t, (*counts, per_cycle))
+        )
 
     def _passed(self, found: MeasuredNoise) -> MeasuredNoise | None:
         self._passes -= 1
         self._found, self._cones = found, None
         return None if self._passes else found
-
-
-def odometry_noise(twists: TwistRecord, known: MeasuredNoise | None) -> MeasuredNoise | None:
-    """Return `known` with the measured noise of the odometry; None if there are too few twists."""
-    white = twists.white()
-    if white is None:
-        return None
-    sigma, interval = white
-    found = known or MeasuredNoise(sigma, np.array(ASSUMED_DRIFT), interval)
-    return replace(found, odometry=sigma, interval=interval)
 
 
 def with_detections(

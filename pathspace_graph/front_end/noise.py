@@ -10,7 +10,7 @@ import numpy as np
 
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
-from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, TwistNoise
+from pathspace_graph.factors.noise import ASSUMED_DRIFT, KnownNoise, MeasuredNoise, TwistNoise
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import NoiseSource, RunNoise
@@ -18,23 +18,18 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .line_noise import LineMeasurement
-from .measurement import Measurement, odometry_noise
-from .sightings import SeenCycle, TwistRecord
+from .measurement import Measurement, SeenCycle, twist_noise, without_repeats
 
 FIRST: Final = 8.0  # driving time before the first measurement of noise (s)
 AGAIN: Final = 1.5  # growth of the driving time between measurements
 MOST_CYCLES: Final = 300  # largest number of newest cycles in a measurement, which bounds its time
-DRIVING_SPEED: Final = 0.3  # least speed of driving (m/s)
 SCALE: Final = SENSOR.index("range_scale")  # index of the scale error of the ranges
-BIAS: Final = SENSOR.index("range_bias")  # index of their bias
 DOUBT_SCALE: Final = (0.8, 0.5)
 """Contradiction of the scale by that of another error: alone, and beside a contradicted one.
 
 A disagreement of ranges and speeds is likelier an error of 3 % of the ranges than one of the odometry from
 3.2 sigmas of the latter on if every twentieth sensor has such an error, and from 2.0 if every other one has.
 """
-SIGMA_FREE: Final = 0.02  # prior sigma of the scale of the ranges where odometry sets the size (-)
-REFERENCE_RANGE: Final = 10.0  # range at which the noise of ranges bounds their scale error (m)
 
 
 class NoiseLearner(Copyable):
@@ -53,7 +48,7 @@ class NoiseLearner(Copyable):
         self.of_sensor = use != "stated"  # whether constant errors are measured: stated noise has none
         self.measured = known.measured  # newest measurement, or the one of a batch on the whole drive
         self._cycles: tuple[SeenCycle, ...] = ()  # newest cycles
-        self._twists = TwistRecord()
+        self._twists: tuple[Odometry, ...] = ()  # newest twists
         self._of_lines = of_lines
         if of_lines:
             import_module("scipy.optimize")  # 50 ms, which no cycle has to spare
@@ -81,15 +76,18 @@ class NoiseLearner(Copyable):
         """Add a cycle at a pose (3,) by dead reckoning; return whether a measurement was completed."""
         if not self.is_learning:
             return False
-        self._twists.add(odometry)
+        self._twists = (*self._twists, odometry)
+        if len(self._twists) > 200:  # cycles, which are joined now and then alone
+            self._twists = (without_repeats(self._twists),)
         seen = SeenCycle(detections, pose.copy(), motion.odometry.twist)
         self._cycles = (*self._cycles[1 - MOST_CYCLES :], seen)
-        if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > DRIVING_SPEED:
+        if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > 0.3:  # m/s
             self._driven += min(detections.t - self._t, 1.0)
         self._t = detections.t
         if self._measurement is None and self._driven >= self._due:
             self._due = AGAIN * self._driven
-            self._measurement = begun(self._cycles, self._twists, self.measured, of_lines=self._of_lines)
+            twists = without_repeats(self._twists)
+            self._measurement = begun(self._cycles, twists, self.measured, of_lines=self._of_lines)
         found = None if self._measurement is None else self._measurement.advance()
         if found is None:
             return False
@@ -112,7 +110,7 @@ class NoiseLearner(Copyable):
         Their covariances are inflated so that sightings of one cone count as independent.
         """
         measured, points = self.measured, detections.points_vehicle
-        if not self.of_sensor or measured is None:
+        if not self.of_sensor or measured is None or len(points) == 0:
             return detections
         covariances = measured.covariances(points, inflated=True) if self.of_detections else None
         if covariances is None:
@@ -142,7 +140,8 @@ class NoiseLearner(Copyable):
         # The prior of the ranges' scale is knowledge of the sensor if the log states it, or covariances at
         # least. Ranges that bend, or have a contradicted scale, are not calibrated; those with a bias hardly
         # are, unless the log says so.
-        known = self.known.sigma_range_scale is not None or not (self.of_detections or contradicted[BIAS])
+        is_biased = contradicted[SENSOR.index("range_bias")]
+        known = self.known.sigma_range_scale is not None or not (self.of_detections or is_biased)
         known = known and not (sensor.trust is not None or contradicted[SCALE] or measured.range_bend)
         if not contradicted.any() and (known or sensor.trust is not None):
             return settings
@@ -152,7 +151,7 @@ class NoiseLearner(Copyable):
             means[SCALE], sigmas[SCALE] = sensor.range_scale, sensor.sigma_range_scale
         elif self.trusts_odometry(settings):
             odometry = replace(odometry, hold_scale=True)
-            sigmas[SCALE] = SIGMA_FREE
+            sigmas[SCALE] = 0.02  # hardly a prior
         else:
             if contradicted[SCALE]:
                 scale, sigma = float(means[SCALE]), max(float(sigmas[SCALE]), odometry.sigma_scale)
@@ -201,13 +200,13 @@ class NoiseLearner(Copyable):
         """Whether the odometry sets the size of the map; by default if its scale is better known.
 
         Systematic errors of a sensor are at least as large as its noise, so the scale of its ranges is known
-        no better than a single range.
+        no better than a single range of 10 m.
         """
         measured, trust = self.measured, settings.calibration.trust
         if trust is not None or measured is None or measured.along is None:
             return trust == "odometry"
-        sigma = float(measured.along.sigmas(np.array([REFERENCE_RANGE]))[0])
-        return sigma > REFERENCE_RANGE * settings.odometry.sigma_scale
+        sigma = float(measured.along.sigmas(np.array([10.0]))[0])
+        return sigma > 10.0 * settings.odometry.sigma_scale
 
 
 def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
@@ -218,18 +217,23 @@ def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
 
 
 def begun(
-    cycles: Sequence[SeenCycle], twists: TwistRecord, known: MeasuredNoise | None, *, of_lines: bool
+    cycles: Sequence[SeenCycle], odometry: Odometry, known: MeasuredNoise | None, *, of_lines: bool
 ) -> Measurement | LineMeasurement | None:
     """Start a measurement on cones or on lines; None if not even the odometry's noise can be estimated."""
-    found = odometry_noise(twists, known)
-    return None if found is None else (LineMeasurement if of_lines else Measurement)(cycles, found)
+    of_twists = twist_noise(odometry)
+    if of_twists is None:
+        return None
+    sigma, interval = of_twists[0].min(axis=0), of_twists[1]
+    found = known or MeasuredNoise(sigma, np.array(ASSUMED_DRIFT), interval)
+    found = replace(found, odometry=sigma, interval=interval)
+    return (LineMeasurement if of_lines else Measurement)(cycles, found)
 
 
 def measure_noise(
-    cycles: Sequence[SeenCycle], twists: TwistRecord, *, of_lines: bool = False
+    cycles: Sequence[SeenCycle], odometry: Odometry, *, of_lines: bool = False
 ) -> MeasuredNoise | None:
     """Measure the noise of cones or of lines; None if not even the odometry's noise can be estimated."""
-    measurement = begun(cycles, twists, None, of_lines=of_lines)
+    measurement = begun(cycles, odometry, None, of_lines=of_lines)
     if measurement is None:
         return None
     while (found := measurement.advance()) is None:

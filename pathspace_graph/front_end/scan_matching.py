@@ -15,7 +15,7 @@ import numpy as np
 
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors import _kernels as kernels
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR, by_sensor
@@ -25,13 +25,6 @@ from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
 # --- points of lines -------------------------------------------------------------------------------------
 
 
-MOST_DOUBLINGS: Final = 1 << 6  # of the side of a cell
-MOST_CELLS: Final = 1 << 20  # in a row of cells, which is more than any sensor sees
-MERGE_CELL: Final = 1.0  # side of the cells (m) in which points are merged: 5 mm beside an arc of 9 m
-MERGE_RANGE: Final = 12.0
-"""Range (m) beyond which the side doubles, and doubles again at each double of it.
-
-Noise grows with the range, so a sensor that sees three times as far needs hardly more points."""
 LINE_REACH: Final = 1.5  # reach of a line by that of a cone: its points are spread over the gap of points
 LEAST_POINTS: Final = 2.0  # least sum of weights of the points of a line
 LEAST_SPREAD: Final = 0.3  # least standard deviation of these along the line, in reaches
@@ -42,23 +35,24 @@ LINE_HELD: Final = np.array([0.1, 10.0, 1.0]) ** 2
 LINES_ALIKE: Final = np.array([1.0, 0.03, 0.003]) ** 2
 """Variances (m^2, m^2, rad^2) of errors that all points of a match share, vehicle frame: nothing is known
 along the lines, and they are taken for straight."""
-HEADING_TOLD: Final = 0.05  # standard deviation of the heading (rad) up to which lines hold the pose
 
 
 def merged(line: Detections) -> Detections:
-    """Return the means of the points of lines that share label and cell."""
-    doublings = np.maximum(np.frexp(np.hypot(*line.points_vehicle.T) / MERGE_RANGE)[1], 0)
-    side = np.ldexp(MERGE_CELL, doublings)
-    column, row = np.floor(line.points_vehicle.T / side).astype(np.intp)
-    keys = ((line.labels * MOST_DOUBLINGS + doublings) * MOST_CELLS + column) * MOST_CELLS + row
+    """Return the means of the points of lines that share label and cell.
+
+    The cells have a side of 1 m, 5 mm beside an arc of 9 m. It doubles at 12 m, and at each double of that:
+    noise grows with the range, so a sensor that sees three times as far needs hardly more points.
+    """
+    doublings = np.maximum(np.frexp(np.hypot(*line.points_vehicle.T) / 12.0)[1], 0)
+    column, row = np.floor(line.points_vehicle.T / np.ldexp(1.0, doublings)).astype(np.intp)
+    # one number for label and cell, as no sensor sees 2^20 cells in a row; unique rows take six times as long
+    keys = (((line.labels << 6) + doublings << 20) + column << 20) + row
     _, first, cell, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
-    points = _means(line.points_vehicle, cell, counts)
-    covariances = _means(line.covariances.reshape(-1, 4), cell, counts) / counts[:, None]
-    return Detections(line.t, points, covariances.reshape(-1, 2, 2), line.labels[first])
-
-
-def _means(values: Array, cell: IntArray, counts: IntArray) -> Array:
-    return np.column_stack([np.bincount(cell.ravel(), column) for column in values.T]) / counts[:, None]
+    columns = [*line.points_vehicle.T, *line.covariances.reshape(-1, 4).T]
+    sums = np.column_stack([np.bincount(cell, values, len(counts)) for values in columns])
+    means = sums / counts[:, None]
+    covariances = means[:, 2:].reshape(-1, 2, 2) / counts[:, None, None]
+    return Detections(line.t, means[:, :2], covariances, line.labels[first])
 
 
 class Seen(NamedTuple):
@@ -73,18 +67,11 @@ class Seen(NamedTuple):
 LEARNED_ERRORS: Final = [SENSOR.index("yaw"), SENSOR.index("latency")]  # errors that are learned
 SIGMAS_ERRORS: Final = (0.02, 0.05)  # rad and s, first: those of a hasty mounting
 SIGMAS_CHANGES: Final = (0.001, 0.005)  # their change in a minute, rad and s
-MINUTE: Final = 60.0
-
 SCAN_MEMORY: Final = 0.65  # age of remembered detections, s, over which odometry hardly drifts
-MOST_REMEMBERED: Final = 2000  # largest number of remembered detections, which bounds the time of a match
-LINE_REMEMBERED: Final = 40  # largest number of points of lines in a remembered cycle
 REACH_FIRST: Final = 1.0
 REACH_LAST: Final = 0.4
 """Reach of the first and the last iteration, m: the weight at distance d is `exp(-d^2 / 2 reach^2)`."""
-MATCH_STEPS: Final = 6
-REACHES: Final = [
-    REACH_FIRST * ((REACH_LAST / REACH_FIRST) ** (1.0 / (MATCH_STEPS - 1))) ** k for k in range(MATCH_STEPS)
-]
+REACHES: Final = [REACH_FIRST * ((REACH_LAST / REACH_FIRST) ** 0.2) ** k for k in range(6)]
 REACHES_CHECK: Final = (REACH_FIRST, REACH_LAST)  # of the check, which begins near the solution
 FARTHEST: Final = 3.0  # distance in reaches from which on a remembered detection has no weight
 MIN_WEIGHT: Final = 0.7  # least sum of weights of a matched detection
@@ -94,14 +81,8 @@ SIGMA_CONE: Final = 0.05  # added to a detection's, m, since one side of a cone 
 LEAST_SHARE: Final = 1e-6  # least det of a pose's information by the product of its diagonal
 MOST_MISFIT: Final = 9.0  # largest whitened square in a misfit that is compared with another
 MIN_DOUBTING: Final = 4  # least number of matched detections of a contradiction
-LARGE_MISFIT: Final = 1.5  # mean-square misfit beyond which its excess scales the detections' covariances
 MISFIT_GAIN: Final = 0.02  # smoothing gain of the mean-square misfit
-MAX_MISFIT: Final = 3.0  # largest misfit of a motion: 1 where the vehicle moved, 4 where it was put down
-MISFIT_ODOMETRY: Final = 2.0  # least misfit at the odometry's own pose in a contradiction
-MISFIT_RATIO: Final = 1.3  # least ratio of that misfit to the one of the match
-
-
-_TINY: Final = float(np.finfo(float).tiny)
+LARGE_MISFIT: Final = 1.5  # mean-square misfit beyond which its excess scales the detections' covariances
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +128,7 @@ class SensorErrors(Copyable):
     def __init__(self, settings: MotionSettings) -> None:
         self.mean: Array = np.zeros(len(LEARNED_ERRORS))  # (2,) yaw (rad, to the left) and latency (s)
         self.covariance: Array = np.diag(np.square(SIGMAS_ERRORS))  # (2, 2) their covariance
-        self._drift: Array = np.diag(np.square(SIGMAS_CHANGES)) / MINUTE
+        self._drift: Array = np.diag(np.square(SIGMAS_CHANGES)) / 60.0
         self._velocity: Array = np.zeros(3)
         self._possible: Array = 0.5 * SCAN_MEMORY * np.array(settings.accelerations)
 
@@ -205,6 +186,9 @@ class ScanMatcher(Copyable):
 
     def __init__(self, settings: MotionSettings, *, of_lines: bool = False) -> None:
         self._settings, self._of_lines = settings, of_lines
+        line = (LINE_REACH, LEAST_POINTS, LEAST_SPREAD, LEAST_SHAPE, LEAST_INSIDE) if of_lines else ()
+        least_share = 0.0 if of_lines else LEAST_SHARE
+        self._limits = (FARTHEST, MIN_WEIGHT, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED, least_share), line
         self._misfit = 1.0  # mean of those of the matches that agreed, the newest counting most
         self.forget()
 
@@ -231,15 +215,18 @@ class ScanMatcher(Copyable):
         return Seen(points, 0.5 * (covariances[:, 0, 0] + covariances[:, 1, 1]))
 
     def remember(self, detections: Detections, twist: Array, pose: Array) -> None:
-        """Remember the detections of a cycle with a pose (3,) and a twist (3,)."""
+        """Remember the detections of a cycle with a pose (3,) and a twist (3,).
+
+        The time of a match is bounded by 40 points of lines in a cycle, and 2000 detections.
+        """
         measured = detections.points_vehicle
         if self._of_lines:
-            measured = measured[:: max(-(-len(measured) // LINE_REMEMBERED), 1)]
+            measured = measured[:: max(-(-len(measured) // 40), 1)]
         columns = np.ascontiguousarray(by_sensor(measured, twist[None])[:, :, LEARNED_ERRORS])
         new = np.empty((len(measured), self._table.shape[1]))
         new[:, 0], new[:, 1:3], new[:, 3:5] = detections.t, pose[:2], to_map(measured, pose[None])
         new[:, 5:] = (rotation(pose[2]) @ columns).reshape(len(measured), 4)
-        self._table = np.concatenate([self._table, new])[-MOST_REMEMBERED:]
+        self._table = np.concatenate([self._table, new])[-2000:]
         self.points = self._table[:, 3:5]
 
     def has(self, seen: Seen, pose: Array) -> BoolArray:
@@ -272,10 +259,11 @@ class ScanMatcher(Copyable):
         if self._of_lines:
             covariance = np.linalg.inv(information + held) + turn @ np.diag(LINES_ALIKE) @ turn.T
             information = np.asarray(np.linalg.inv(covariance), np.float64)
-            is_certain = covariance[2, 2] < HEADING_TOLD**2
+            is_certain = covariance[2, 2] < 0.05**2  # rad^2 of the heading: then lines hold the pose
         else:
             (w, _, a), (_, _, b), (_, _, turning) = information.tolist()  # of x and y: w times the identity
-            is_certain = w * (w * turning - a * a - b * b) / max(w * w * turning, _TINY) > LEAST_SHARE
+            determinant, product = w * (w * turning - a * a - b * b), w * w * turning
+            is_certain = determinant / max(product, np.finfo(float).tiny) > LEAST_SHARE
         return Match(pose, information, matched, count, cost / count) if is_certain else None
 
     def misfit(self, seen: Seen, pose: Array) -> float:
@@ -297,10 +285,3 @@ class ScanMatcher(Copyable):
         """Learn from a match that agrees with the odometry, dt (s) after the previous cycle."""
         self._misfit += MISFIT_GAIN * (matched.misfit - self._misfit)
         self.errors.update(difference.off, difference.covariance, difference.shifts, dt)
-
-    @property
-    def _limits(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Limits of the kernels for all detections, and those for points of lines."""
-        line = (LINE_REACH, LEAST_POINTS, LEAST_SPREAD, LEAST_SHAPE, LEAST_INSIDE) if self._of_lines else ()
-        least_share = 0.0 if self._of_lines else LEAST_SHARE
-        return (FARTHEST, MIN_WEIGHT, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED, least_share), line

@@ -17,7 +17,7 @@ from pathspace_graph.batch.start import StartMap
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
-from pathspace_graph.front_end.cone_rows import ROW_GAP
+from pathspace_graph.front_end.sides import ROW_GAP
 from pathspace_graph.graph.smoother import place_again
 from pathspace_graph.io.map import NO_CONES
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT

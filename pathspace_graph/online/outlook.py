@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import left_of
-from pathspace_graph.front_end.cone_rows import ConeRow, extend_rows
+from pathspace_graph.front_end.sides import ConeRow, extend_rows
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
 from pathspace_graph.mapping.curve_map import CurveMap

@@ -23,9 +23,14 @@ from pathspace_graph.factors.noise import ASSUMED_DRIFT, ray_sigmas
 from pathspace_graph.factors.se2 import move_points, relative
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.gate import TWIST, check_usable
-from pathspace_graph.front_end.measurement import LEAST_NOISE
+from pathspace_graph.front_end.measurement import (
+    FOLLOW_RANGE,
+    GATE_MOST,
+    LEAST_NOISE,
+    dead_reckoned,
+    twist_noise,
+)
 from pathspace_graph.front_end.scan_matching import MIN_MATCHED
-from pathspace_graph.front_end.sightings import FOLLOW_RANGE, GATE_MOST, TwistRecord
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, covariances_of
 from pathspace_graph.io.log_files import read_log
@@ -34,7 +39,7 @@ from pathspace_graph.io.tables import read_table
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.settings.online import LimitSettings
 
-from .regression import Better, Complex, Fit, Regression, dead_reckoned, far_better, motions_of
+from .regression import Better, Complex, Fit, Regression, far_better, motions_of
 
 
 @dataclass(frozen=True)
@@ -429,12 +434,11 @@ def side_hints(log: Log) -> list[Hint]:
 
 def _odometry_hints(log: Log) -> list[Hint]:
     """Compare white noise: orders of differences that disagree contain motion as well."""
-    twists = TwistRecord()
-    twists.add(log.odometry)
-    orders, white = twists.orders(), twists.white()
-    if orders is None or white is None:
+    found = twist_noise(log.odometry)
+    if found is None:
         return []
-    (least, interval), stated, hints = white, log.odometry_sigma, []
+    (orders, interval), stated, hints = found, log.odometry_sigma, []
+    least = orders.min(axis=0)
     agree = orders.max(axis=0) < 1.2 * least
     most = np.hypot(least, np.array(ASSUMED_DRIFT) / np.sqrt(interval))
     for which, values, size in (

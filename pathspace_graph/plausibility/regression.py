@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import relative
+from pathspace_graph.front_end.measurement import dead_reckoned
 from pathspace_graph.front_end.scan_matching import (
     FARTHEST,
     LEAST_SHARE,
@@ -90,11 +91,6 @@ def motions_of(log: Log, most: int = 1000, fewest: int = MIN_DOUBTING, fastest: 
     table = np.array(sorted(rows, key=lambda row: row[0] + row[1])).reshape(-1, 14)
     begin, end, vx, vy, rate = table[:, :5].T
     return Motions(begin, end, vx + 1j * vy, rate, table[:, 5:].reshape(-1, 3, 3), tried)
-
-
-def dead_reckoned(odometry: Odometry, stamps: Array) -> Array:
-    """Poses (n, 3) at stamps (n,) in s, by the odometry alone."""
-    return np.column_stack([np.interp(stamps, odometry.t, column) for column in odometry.poses().T])
 
 
 def register(

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.factors.sensor import by_sensor
+from pathspace_graph.front_end.measurement import SeenCycle
 from pathspace_graph.front_end.noise import measure_noise
-from pathspace_graph.front_end.sightings import SeenCycle, TwistRecord
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.sim.vehicle import integrate
@@ -40,7 +40,7 @@ class Camera:
     """A range r beyond 9 m reads this (1/m) times `(r - 9)^2` longer."""
     seconds: float = 60.0
 
-    def drive(self, seed: int) -> tuple[list[SeenCycle], TwistRecord]:
+    def drive(self, seed: int) -> tuple[list[SeenCycle], Odometry]:
         """Returns the cycles of a winding drive at about 10 m/s, where they truly were, and its twists."""
         rng = np.random.default_rng(seed)
         t = np.arange(round(self.seconds * ODOMETRY_RATE)) / ODOMETRY_RATE
@@ -49,8 +49,7 @@ class Camera:
             [10.0 + 3.0 * np.sin(t / 2.3 + phase[0]), np.zeros_like(t), 0.6 * np.sin(t / 1.7 + phase[1])]
         )
         poses = integrate(twists[:-1], 1.0 / ODOMETRY_RATE)
-        record = TwistRecord()
-        record.add(Odometry(t, twists + WHITE * rng.normal(size=twists.shape)))
+        odometry = Odometry(t, twists + WHITE * rng.normal(size=twists.shape))
         cones, labels = _cones(poses, rng)
         slow = rng.normal(size=(2, len(cones)))
         rho = np.exp(-CYCLE / ODOMETRY_RATE / np.array([self.along.time, self.across.time]))[:, None]
@@ -63,7 +62,7 @@ class Camera:
             seen = (ranges > 2.0) & (ranges < 22.0) & (np.abs(np.arctan2(true[:, 1], true[:, 0])) < 1.0)
             points = self._measured(true[seen], twists[k], slow[:, seen], white[:, seen])
             cycles.append(SeenCycle(detections(t[k], points, labels[seen]), poses[k], twists[k]))
-        return cycles, record
+        return cycles, odometry
 
     def _measured(self, true: Array, twist: Array, slow: Array, white: Array) -> Array:
         """Returns the detections of cones, of which the corrected ones are where they are plus noise."""

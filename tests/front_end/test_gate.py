@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from pathspace_graph import ReadingError
 from pathspace_graph.errors import InputError, PathspaceError
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.front_end import gate
-from pathspace_graph.front_end.gate import Admitted, Gate, Newest
+from pathspace_graph.front_end.gate import Admitted, Gate
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import LEFT, RIGHT
@@ -27,7 +26,7 @@ from ..scenes.drives import ahead, corridor, exact_log
 
 Array = NDArray[np.float64]
 LIMITS = LimitSettings()
-NEWEST = Newest(1.0, np.array([4.0, 0.1, 0.2]))
+NEWEST = 1.0, np.array([4.0, 0.1, 0.2])
 STAMPS = np.array([1.0, 1.02, 1.06])
 TWISTS = np.array([[5.0, 0.0, 0.1], [6.0, 0.0, 0.2], [7.0, 0.0, 0.3]])
 
@@ -55,8 +54,8 @@ def with_entry(array: np.ndarray[Any, Any], index: Any, value: Any) -> np.ndarra
     return changed
 
 
-def through(twists: Any = None, cycle: Any = None, newest: Newest = NEWEST) -> Admitted:
-    return Gate(LIMITS).admit(twists or odometry(), cycle or detections(), newest)
+def through(twists: Any = None, cycle: Any = None, newest: Any = NEWEST) -> Admitted:
+    return Gate(LIMITS).admit(twists or odometry(), cycle or detections(), *newest)
 
 
 # --- what is used ----------------------------------------------------------------------------------------
@@ -64,7 +63,7 @@ def through(twists: Any = None, cycle: Any = None, newest: Newest = NEWEST) -> A
 
 def test_a_good_cycle_goes_through_as_it_is_in_arrays_of_its_own() -> None:
     handed, cycle = odometry(), detections()
-    admitted = Gate(LIMITS).admit(handed, cycle, NEWEST)
+    admitted = Gate(LIMITS).admit(handed, cycle, *NEWEST)
     np.testing.assert_array_equal(admitted.odometry.t, STAMPS)
     np.testing.assert_array_equal(admitted.odometry.twist, TWISTS)
     for name in ("t", "points_vehicle", "covariances", "labels"):
@@ -83,7 +82,7 @@ def test_a_good_cycle_goes_through_as_it_is_in_arrays_of_its_own() -> None:
 def test_the_first_cycle_may_have_any_stamp_and_no_twist() -> None:
     empty = odometry(np.zeros(0), np.zeros((0, 3)))
     for t in (-5.0, 0.0, 1.7e9):
-        assert len(through(empty, detections(t), Newest()).odometry.t) == 0
+        assert len(through(empty, detections(t), ()).odometry.t) == 0
 
 
 def test_plain_lists_and_whole_numbers_are_numbers() -> None:
@@ -97,16 +96,14 @@ def test_plain_lists_and_whole_numbers_are_numbers() -> None:
 
 def test_the_twist_measured_last_is_held_until_the_first_one_handed_over() -> None:
     admitted = through(odometry(STAMPS[1:], TWISTS[1:]))
-    assert NEWEST.twist is not None
     np.testing.assert_array_equal(admitted.odometry.t, STAMPS)
-    np.testing.assert_array_equal(admitted.odometry.twist, [NEWEST.twist, *TWISTS[1:]])
+    np.testing.assert_array_equal(admitted.odometry.twist, [NEWEST[1], *TWISTS[1:]])
 
 
 def test_without_any_twist_the_one_measured_last_is_held() -> None:
     admitted = through(odometry(np.zeros(0), np.zeros((0, 3))))
-    assert NEWEST.twist is not None
     np.testing.assert_array_equal(admitted.odometry.t, [1.0])
-    np.testing.assert_array_equal(admitted.odometry.twist, [NEWEST.twist])
+    np.testing.assert_array_equal(admitted.odometry.twist, [NEWEST[1]])
 
 
 def test_what_was_in_force_before_the_newest_cycle_is_left_out() -> None:
@@ -120,145 +117,89 @@ def test_what_was_in_force_before_the_newest_cycle_is_left_out() -> None:
 
 # --- what is refused -------------------------------------------------------------------------------------
 
-Bad = tuple[Callable[[], Admitted], str, int | None, str]
-REFUSED: dict[str, Bad] = {
-    "no odometry": (lambda: Gate(LIMITS).admit(None, detections(), NEWEST), "odometry", None, "Odometry"),  # type: ignore[arg-type]
-    "no detections": (lambda: Gate(LIMITS).admit(odometry(), None, NEWEST), "detections", None, "Detections"),  # type: ignore[arg-type]
-    "a stamp that is none": (lambda: through(cycle=detections(None)), "detections.t", None, "number"),
-    "NaN as a stamp": (lambda: through(cycle=detections(np.nan)), "detections.t", None, "found nan"),
-    "infinity as a stamp": (lambda: through(cycle=detections(-np.inf)), "detections.t", None, "-inf"),
-    "nanoseconds": (lambda: through(cycle=detections(1e18)), "detections.t", None, "are in seconds"),
+
+def stamps(row: int, value: float) -> Odometry:
+    return odometry(with_entry(STAMPS, row, value))
+
+
+def twist(row: int, column: int, value: float) -> Odometry:
+    return odometry(twists=with_entry(TWISTS, (row, column), value))
+
+
+MANY = Detections(1.1, np.ones((501, 2)), np.tile(np.eye(2), (501, 1, 1)), np.zeros(501, int))
+STAMPED = {
+    "a stamp that is none": (None, "number"),
+    "NaN as a stamp": (np.nan, "found nan"),
+    "infinity as a stamp": (-np.inf, "-inf"),
+    "nanoseconds": (1e18, "are in seconds"),
+    "milliseconds": (1100.0, "are in seconds"),
+    "a minute ahead": (61.2, "at most 30 s after"),
+    "backwards": (0.9, "later than the newest"),
+    "twice": (1.0, "later than the newest"),
+}
+DRIVEN = {
+    "a twist after the cycle": (odometry(STAMPS + 0.05), "t", 2, "none later than the cycle"),
+    "twists out of order": (odometry(STAMPS[[0, 2, 1]]), "t", 2, "later than the one before"),
+    "a twist twice": (odometry(STAMPS[[0, 1, 1]]), "t", 2, "later than the one"),
+    "NaN as a twist's stamp": (stamps(1, np.nan), "t", 1, "found nan"),
+    "NaN as a speed": (twist(1, 0, np.nan), "twist", 1, "vx from -100 to 100 m/s, found nan"),
+    "infinite speed": (twist(0, 1, np.inf), "twist", 0, "vy from -100 to 100 m/s, found inf"),
+    "no vehicle's speed": (twist(2, 0, -1e5), "twist", 2, "vx from -100 to 100 m/s, found -100000"),
+    "no vehicle's turn": (twist(2, 2, 11.0), "twist", 2, "wz from -10 to 10 rad/s, found 11"),
+    "fewer twists": (
+        odometry(twists=TWISTS[:2]),
+        "twist",
+        None,
+        r"shape \(3, 3\), found .* \(2, 3\)",
+    ),
+    "twists of two numbers": (odometry(twists=TWISTS[:, :2]), "twist", None, "shape"),
+    "words as twists": (odometry(twists=[["a"] * 3] * 3), "twist", None, "numbers"),
+    "ragged twists": (odometry(twists=[[1.0], [1.0, 2.0], []]), "twist", None, "different lengths"),
+}
+SEEN = {
+    "points of three": (
+        detections(points_vehicle=np.zeros((3, 3))),
+        "points_vehicle",
+        None,
+        r"\(m, 2\)",
+    ),
+    "too few covariances": (detections(covariances=np.zeros((2, 2, 2))), "covariances", None, "shape"),
+    "too few labels": (detections(labels=[0]), "labels", None, "shape"),
+    "labels as words": (detections(labels=["left", "right", "left"]), "labels", None, "integers"),
+    "labels as numbers": (detections(labels=np.array([0.0, 1.0, 1.0])), "labels", None, "integers"),
+    "no such label": (detections(labels=np.array([0, 7, 1])), "labels", 1, "found 7"),
+    "too many detections": (MANY, "points_vehicle", None, "at most 500 rows"),
+}
+Refused = tuple[Any, Any, Any, str, int | None, str]
+REFUSED: dict[str, Refused] = {
+    "no odometry": (None, detections(), NEWEST, "odometry", None, "Odometry"),
+    "no detections": (odometry(), None, NEWEST, "detections", None, "Detections"),
     "nanoseconds at first": (
-        lambda: through(cycle=detections(1.7e18), newest=Newest()),
+        odometry(),
+        detections(1.7e18),
+        (),
         "detections.t",
         None,
         "are in seconds",
     ),
-    "milliseconds": (lambda: through(cycle=detections(1100.0)), "detections.t", None, "are in seconds"),
-    "a minute ahead": (lambda: through(cycle=detections(61.2)), "detections.t", None, "at most 30 s after"),
-    "backwards": (lambda: through(cycle=detections(0.9)), "detections.t", None, "later than the newest"),
-    "at once": (
-        lambda: through(odometry(np.zeros(0), np.zeros((0, 3))), detections(1.0005)),
-        "detections.t",
-        None,
-        "at least 0.001 s after the newest cycle",
-    ),
-    "twice": (lambda: through(cycle=detections(1.0)), "detections.t", None, "later than the newest"),
-    "a twist after the cycle": (
-        lambda: through(odometry(STAMPS + 0.05)),
-        "odometry.t",
-        2,
-        "none later than the cycle",
-    ),
-    "twists out of order": (
-        lambda: through(odometry(STAMPS[[0, 2, 1]])),
-        "odometry.t",
-        2,
-        "later than the one before",
-    ),
-    "a twist twice": (lambda: through(odometry(STAMPS[[0, 1, 1]])), "odometry.t", 2, "later than the one"),
-    "NaN as a twist's stamp": (
-        lambda: through(odometry(with_entry(STAMPS, 1, np.nan))),
-        "odometry.t",
-        1,
-        "found nan",
-    ),
+    "at once": (NONE, detections(1.0005), NEWEST, "detections.t", None, "at least 0.001 s after the newest"),
     "a minute without twists": (
-        lambda: through(odometry(STAMPS + np.array([0.0, 60.0, 60.0])), detections(61.1)),
-        "odometry.t",
-        1,
-        "at most 30 s after the reading at 1 s",
+        *(odometry(STAMPS + np.array([0.0, 60.0, 60.0])), detections(61.1), NEWEST),
+        *("odometry.t", 1, "at most 30 s after the reading at 1 s"),
     ),
-    "NaN as a speed": (
-        lambda: through(odometry(twists=with_entry(TWISTS, (1, 0), np.nan))),
-        "odometry.twist",
-        1,
-        "vx from -100 to 100 m/s, found nan",
-    ),
-    "infinite speed": (
-        lambda: through(odometry(twists=with_entry(TWISTS, (0, 1), np.inf))),
-        "odometry.twist",
-        0,
-        "vy from -100 to 100 m/s, found inf",
-    ),
-    "no vehicle's speed": (
-        lambda: through(odometry(twists=with_entry(TWISTS, (2, 0), -1e5))),
-        "odometry.twist",
-        2,
-        "vx from -100 to 100 m/s, found -100000",
-    ),
-    "no vehicle's turn": (
-        lambda: through(odometry(twists=with_entry(TWISTS, (2, 2), 11.0))),
-        "odometry.twist",
-        2,
-        "wz from -10 to 10 rad/s, found 11",
-    ),
-    "fewer twists than stamps": (
-        lambda: through(odometry(twists=TWISTS[:2])),
-        "odometry.twist",
-        None,
-        r"the shape \(3, 3\), found the shape \(2, 3\)",
-    ),
-    "twists of two numbers": (
-        lambda: through(odometry(twists=TWISTS[:, :2])),
-        "odometry.twist",
-        None,
-        "shape",
-    ),
-    "words as twists": (lambda: through(odometry(twists=[["a"] * 3] * 3)), "odometry.twist", None, "numbers"),
-    "ragged twists": (
-        lambda: through(odometry(twists=[[1.0], [1.0, 2.0], []])),
-        "odometry.twist",
-        None,
-        "different lengths",
-    ),
-    "points of three numbers": (
-        lambda: through(cycle=detections(points_vehicle=np.zeros((3, 3)))),
-        "detections.points_vehicle",
-        None,
-        r"the shape \(m, 2\)",
-    ),
-    "too few covariances": (
-        lambda: through(cycle=detections(covariances=np.zeros((2, 2, 2)))),
-        "detections.covariances",
-        None,
-        "shape",
-    ),
-    "too few labels": (lambda: through(cycle=detections(labels=[0])), "detections.labels", None, "shape"),
-    "labels as words": (
-        lambda: through(cycle=detections(labels=["left", "right", "left"])),
-        "detections.labels",
-        None,
-        "integers",
-    ),
-    "labels as numbers": (
-        lambda: through(cycle=detections(labels=np.array([0.0, 1.0, 1.0]))),
-        "detections.labels",
-        None,
-        "integers",
-    ),
-    "no such label": (
-        lambda: through(cycle=detections(labels=np.array([0, 7, 1]))),
-        "detections.labels",
-        1,
-        "found 7",
-    ),
-    "too many detections": (
-        lambda: through(
-            cycle=Detections(1.1, np.ones((501, 2)), np.tile(np.eye(2), (501, 1, 1)), np.zeros(501, int))
-        ),
-        "detections.points_vehicle",
-        None,
-        "at most 500 rows",
-    ),
+    **{
+        k: (odometry(), detections(t), NEWEST, "detections.t", None, said) for k, (t, said) in STAMPED.items()
+    },
+    **{k: (own, detections(), NEWEST, f"odometry.{f}", *said) for k, (own, f, *said) in DRIVEN.items()},
+    **{k: (odometry(), own, NEWEST, f"detections.{f}", *said) for k, (own, f, *said) in SEEN.items()},
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_be_used_is_named_with_field_row_and_what_was_expected(name: str) -> None:
-    call, field, row, text = REFUSED[name]
+    given, cycle, newest, field, row, text = REFUSED[name]
     with pytest.raises(ReadingError, match=text) as caught:
-        call()
+        Gate(LIMITS).admit(given, cycle, *newest)
     assert (caught.value.field, caught.value.row) == (field, row)
     assert field in str(caught.value)
     assert isinstance(caught.value, PathspaceError)
@@ -275,20 +216,20 @@ def test_an_error_survives_the_way_from_a_worker() -> None:
 def test_what_is_refused_is_a_setting() -> None:
     wide = LimitSettings(speed=2e5, silence=100.0)
     fast = odometry(twists=with_entry(TWISTS, (2, 0), 1e5))
-    assert Gate(wide).admit(fast, detections(61.2), NEWEST).odometry.twist[2, 0] == 1e5
+    assert Gate(wide).admit(fast, detections(61.2), *NEWEST).odometry.twist[2, 0] == 1e5
 
 
 def test_one_stamp_far_ahead_is_an_error_and_two_that_agree_are_a_vehicle_that_was_silent() -> None:
     gate = Gate(LimitSettings())
     for late in (61.0, 500.0, 961.0):
         with pytest.raises(ReadingError, match="at most 30 s after"):
-            gate.admit(odometry(), detections(late), NEWEST)
-    admitted = gate.admit(odometry(), detections(961.1), NEWEST)
+            gate.admit(odometry(), detections(late), *NEWEST)
+    admitted = gate.admit(odometry(), detections(961.1), *NEWEST)
     assert (admitted.detections.t, admitted.refused) == (961.1, 3)
-    assert admitted.odometry.t[0] == NEWEST.t  # the last twist is held meanwhile
+    assert admitted.odometry.t[0] == NEWEST[0]  # the last twist is held meanwhile
     with pytest.raises(ReadingError):
-        gate.admit(odometry(), detections(2000.0), Newest(961.1))
-    assert gate.admit(odometry(), detections(NEWEST.t + 0.1), NEWEST).refused == 1
+        gate.admit(odometry(), detections(2000.0), 961.1)
+    assert gate.admit(odometry(), detections(NEWEST[0] + 0.1), *NEWEST).refused == 1
 
 
 # --- what is dropped -------------------------------------------------------------------------------------
@@ -362,7 +303,7 @@ def test_the_notice_comes_once_in_a_row() -> None:
     told = []
     for k, spoilt in enumerate([True, True, False, True]):
         cycle = detections(1.1 + k, **(bad if spoilt else {}))
-        told.append(bool(gate.admit(odometry(STAMPS + k), cycle, Newest(1.0 + k)).notice))
+        told.append(bool(gate.admit(odometry(STAMPS + k), cycle, 1.0 + k).notice))
     assert told == [True, False, False, True]
 
 
@@ -370,9 +311,9 @@ def test_refused_cycles_are_counted_until_one_is_used() -> None:
     gate = Gate(LIMITS)
     for _ in range(3):
         with pytest.raises(ReadingError):
-            gate.admit(odometry(), detections(np.nan), NEWEST)
-    assert gate.admit(odometry(), detections(), NEWEST).refused == 3
-    assert gate.admit(odometry(STAMPS + 1), detections(2.1), Newest(2.0)).refused == 0
+            gate.admit(odometry(), detections(np.nan), *NEWEST)
+    assert gate.admit(odometry(), detections(), *NEWEST).refused == 3
+    assert gate.admit(odometry(STAMPS + 1), detections(2.1), 2.0).refused == 0
 
 
 # --- logs ------------------------------------------------------------------------------------------------
@@ -430,7 +371,7 @@ def test_messages_of_two_cameras_are_one_cycle_or_each_is_used_at_its_time(
 def test_a_detector_with_stamps_in_milliseconds_may_give_a_cycle_in_each() -> None:
     """4.201 - 4.2 is less than 0.001 in doubles."""
     assert 4.201 - 4.2 < 1e-3
-    assert Gate(LIMITS).admit(NONE, detections(4.201), Newest(4.2)).refused == 0
+    assert Gate(LIMITS).admit(NONE, detections(4.201), 4.2).refused == 0
 
 
 def test_a_laser_scan_is_thinned_evenly_where_points_are_of_lines() -> None:
@@ -438,8 +379,8 @@ def test_a_laser_scan_is_thinned_evenly_where_points_are_of_lines() -> None:
     x = np.linspace(0.1, 20.0, 1080)
     points, covariances = np.column_stack([x, np.full(1080, 2.0)]), np.tile(0.01 * np.eye(2), (1080, 1, 1))
     scan = Detections(4.3, points, covariances, np.zeros(1080, int))
-    admitted = Gate(LIMITS, of_lines=True).admit(NONE, scan, Newest(4.2))
+    admitted = Gate(LIMITS, of_lines=True).admit(NONE, scan, 4.2)
     np.testing.assert_array_equal(admitted.detections.points_vehicle, points[::3])
     assert admitted.dropped == 0
     with pytest.raises(ReadingError, match="at most 500 rows, found 1080"):
-        Gate(LIMITS).admit(NONE, scan, Newest(4.2))
+        Gate(LIMITS).admit(NONE, scan, 4.2)

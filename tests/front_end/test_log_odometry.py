@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.front_end.log_odometry import chained, half_square, sensor_prior
-from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, control_keys, pose_keys
+from pathspace_graph.graph.variables import SENSOR_KEY, Variables, pose_keys
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry
 from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
@@ -14,29 +14,12 @@ from pathspace_graph.settings.online import CalibrationSettings, OdometrySetting
 KNOWN, ESTIMATED = CalibrationSettings(sensor=False), CalibrationSettings()
 
 
-def test_both_calibrations_are_one_view() -> None:
-    variables = Variables()
-    variables.insert_calibrations(np.arange(7.0))
-    variables.insert(control_keys(0, np.arange(2)), np.zeros(4))
-    variables.insert(pose_keys(np.arange(1)), np.zeros(3))
-    np.testing.assert_array_equal(variables.calibrations, np.arange(7.0))
-    np.testing.assert_array_equal(variables.calibration_keys, [CALIBRATION_KEY, SENSOR_KEY])
-    variables.calibrations[:] = 1.0
-    np.testing.assert_array_equal(variables.calibration, 1.0)
-    np.testing.assert_array_equal(variables.sensor, 1.0)
-
-
-def test_the_prior_counts_in_its_sigmas() -> None:
-    rows = sensor_prior(2.0 * np.array(ESTIMATED.sigmas), ESTIMATED, 3)
-    np.testing.assert_allclose(rows.residual, 2.0)
-    np.testing.assert_allclose(np.diag(rows.jacobian) * ESTIMATED.sigmas, 1.0)
-    np.testing.assert_array_equal(rows.keys, SENSOR_KEY + 3)
-
-
-def test_the_prior_counts_from_its_mean() -> None:
+def test_the_prior_counts_from_its_mean_in_its_sigmas() -> None:
     known = CalibrationSettings(yaw=0.02, lateral=-0.3, latency=0.05, range_scale=-0.04, range_bias=0.1)
     off = np.array([1.0, -2.0, 3.0, 0.0, 1.0])
-    rows = sensor_prior(np.array([0.02, -0.3, 0.05, -0.04, 0.1] + off * known.sigmas), known)
+    rows = sensor_prior(np.array([0.02, -0.3, 0.05, -0.04, 0.1] + off * known.sigmas), known, 3)
+    np.testing.assert_allclose(np.diag(rows.jacobian) * known.sigmas, 1.0)
+    np.testing.assert_array_equal(rows.keys, SENSOR_KEY + 3)
     np.testing.assert_allclose(rows.residual, off, atol=1e-12)
     assert half_square([rows]) == pytest.approx(0.5 * 15.0)
 

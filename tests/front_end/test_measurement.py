@@ -1,4 +1,4 @@
-"""Noise and constant errors of a sensor that are measured without a map, on drives where both are known."""
+"""What odometry and detections alone show of noise and constant errors, on drives where both are known."""
 
 from __future__ import annotations
 
@@ -12,28 +12,241 @@ from scipy.stats import chi2
 
 from pathspace_graph.factors._kernels import by_constants
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
-from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.factors.sensor import BENDS_FROM
+from pathspace_graph.factors.se2 import to_map, to_vehicle
+from pathspace_graph.factors.sensor import BENDS_FROM, by_sensor
 from pathspace_graph.front_end import measurement
 from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.measurement import (
+    FOLLOW_RANGE,
     MIN_ROWS,
+    MIN_TWISTS,
     MODEL_ERROR,
+    MOST_TWISTS,
     OF_BEND,
     PASSES,
     PRIOR,
     ROUNDS_AGAIN,
     ROUNDS_FIRST,
+    SeenCycle,
+    Sightings,
+    dead_reckoned,
+    twist_noise,
+    without_repeats,
 )
 from pathspace_graph.front_end.noise import begun, measure_noise
-from pathspace_graph.front_end.sightings import TwistRecord
-from pathspace_graph.io.log import Log
+from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.labels import LEFT
 from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track_generator import generate_track
+from pathspace_graph.sim.vehicle import integrate
 
-from .scenes import WHITE, Camera
+from ..scenes.drives import detections
+from .scenes import WHITE as SCENE_WHITE
+from .scenes import Camera
 
 Array = NDArray[np.float64]
+
+NO_ERRORS = MeasuredNoise(np.ones(3), np.ones(3), 0.02)
+PERIOD = 0.1
+WHITE = np.array([0.06, 0.03, 0.004])
+
+
+# --- twists ----------------------------------------------------------------------------------------------
+
+
+def white(t: Array, twists: Array) -> tuple[Array, float] | None:
+    """White noise and interval of twists that come some for each cycle."""
+    parts = [Odometry(t[begin : begin + 7], twists[begin : begin + 7]) for begin in range(0, len(t), 7)]
+    found = twist_noise(without_repeats(parts))
+    return None if found is None else (found[0].min(axis=0), found[1])
+
+
+def noisy_twists(rate: float, count: int, seed: int) -> tuple[Array, Array]:
+    """Returns stamps and twists of a car that speeds up and down and weaves, with white noise."""
+    t = np.arange(count) / rate
+    smooth = [10.0 + 4.0 * np.sin(t / 1.5), 0.2 * np.sin(t / 1.1), 0.5 * np.sin(t / 0.9)]
+    return t, np.column_stack(smooth) + WHITE * np.random.default_rng(seed).normal(size=(count, 3))
+
+
+@pytest.mark.parametrize("rate", [10.0, 40.0, 100.0])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_white_noise_is_told_from_the_motion_at_any_rate(rate: float, seed: int) -> None:
+    found = white(*noisy_twists(rate, 4000, seed))
+    assert found is not None
+    np.testing.assert_allclose(found[0], WHITE, rtol=0.1)
+    assert found[1] == pytest.approx(1.0 / rate, rel=1e-9)
+
+
+def test_a_twist_that_is_only_held_is_no_measurement() -> None:
+    """Each is repeated twice at three times the rate: noise and interval are those of the measured ones."""
+    t, twists = noisy_twists(20.0, 600, 2)
+    expected = white(t, twists)
+    held = white(np.arange(1800) / 60.0, np.repeat(twists, 3, axis=0))
+    assert expected is not None and held is not None
+    np.testing.assert_array_equal(held[0], expected[0])
+    assert held[1] == pytest.approx(0.05, rel=1e-9)
+
+
+def test_a_twist_that_a_cycle_hands_on_from_the_one_before_counts_once() -> None:
+    """The first twist of a cycle is the one in force when it began, at a stamp that may be in the past."""
+    t, twists = noisy_twists(20.0, 200, 3)
+    parts = [slice(max(begin - 1, 0), begin + 5) for begin in range(0, 200, 5)]
+    found = without_repeats([Odometry(t[part], twists[part]) for part in parts])
+    np.testing.assert_array_equal(found.t, t)
+    np.testing.assert_array_equal(found.twist, twists)
+
+
+def test_a_stop_says_nothing_of_the_noise_in_motion() -> None:
+    t, twists = noisy_twists(40.0, 3000, 4)
+    stands = (t > 20.0) & (t < 40.0)
+    twists[stands] = 1e-4 * np.random.default_rng(5).normal(size=(int(stands.sum()), 3))
+    found = white(t, twists)
+    assert found is not None
+    np.testing.assert_allclose(found[0], WHITE, rtol=0.15)
+
+
+def test_few_twists_say_nothing() -> None:
+    t, twists = noisy_twists(40.0, MIN_TWISTS, 0)
+    assert white(t[:-1], twists[:-1]) is None
+    assert white(t, twists) is not None
+    assert white(t, np.tile(twists[0], (len(t), 1))) is None
+
+
+def test_the_order_of_least_noise_counts_where_the_motion_is_fast() -> None:
+    """Second differences of a sine of 0.3 rad a sample are ten times the noise, fourth ones are below it."""
+    twists = 0.5 * np.sin(0.3 * np.arange(2000))[:, None] + [8.0, 0.0, 0.0]
+    twists += 0.002 * np.random.default_rng(0).normal(size=(2000, 3))
+    found = twist_noise(Odometry(np.arange(2000) / 40.0, twists))
+    assert found is not None
+    assert (found[0][0] > 4.0 * found[0][2]).all()
+    np.testing.assert_allclose(found[0].min(axis=0), 0.002, rtol=0.25)
+
+
+def test_a_long_drive_keeps_the_newest_twists_alone() -> None:
+    count = 2 * MOST_TWISTS
+    t, twists = noisy_twists(40.0, count, 6)
+    twists[: count // 2] += np.random.default_rng(7).normal(size=(count // 2, 3))  # a rough road before
+    assert len(without_repeats([Odometry(t, twists)]).t) == MOST_TWISTS
+    found = white(t, twists)
+    assert found is not None
+    np.testing.assert_allclose(found[0], WHITE, rtol=0.15)
+
+
+# --- dead reckoning --------------------------------------------------------------------------------------
+
+
+def test_a_pose_between_two_twists_is_on_the_arc_of_the_first_one() -> None:
+    """A quarter of a circle of radius 5 m in 1 s, then straight ahead; nothing moves before the first."""
+    turn = 0.5 * np.pi
+    odometry = Odometry(np.array([10.0, 11.0]), np.array([[5.0 * turn, 0.0, turn], [4.0, 0.0, 0.0]]))
+    found = dead_reckoned(odometry, np.array([9.0, 10.5, 11.0, 12.5]))
+    half = np.sqrt(0.5)
+    expected = [[0, 0, 0], [5 * half, 5 - 5 * half, turn / 2], [5, 5, turn], [5, 11, turn]]
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+# --- cones that are followed -----------------------------------------------------------------------------
+
+
+def follow(cycles: list[SeenCycle], known: MeasuredNoise) -> Sightings:
+    return Sightings.of(cycles).tracked(known)
+
+
+def drive(
+    twist: tuple[float, float, float], cycles: int, cones: Array, labels: list[int] | None = None
+) -> list[SeenCycle]:
+    """Returns cycles of a drive with one twist from the origin that see all cones ahead exactly."""
+    twists = np.tile(twist, (cycles, 1))
+    poses = integrate(twists[:-1], PERIOD) if cycles > 1 else np.zeros((1, 3))
+    found, names = [], np.array(labels or [LEFT] * len(cones), np.intp)
+    for k, pose in enumerate(poses):
+        points = to_vehicle(cones, np.tile(pose, (len(cones), 1)))
+        ahead = points[:, 0] > 0.0
+        found.append(SeenCycle(detections(PERIOD * k, points[ahead], names[ahead]), pose, twists[k]))
+    return found
+
+
+def counts(found: Sightings) -> list[int]:
+    """Number of sightings of each cone."""
+    return np.bincount(found.cone).tolist()
+
+
+def test_one_cone_has_one_number_as_long_as_it_is_seen() -> None:
+    cycles = drive((8.0, 0.0, 0.1), 24, np.array([[20.0, 2.0]]))
+    found = follow(cycles, NO_ERRORS)
+    assert counts(found) == [24]
+    np.testing.assert_array_equal(found.t, [cycle.detections.t for cycle in cycles])
+    np.testing.assert_array_equal(found.point, np.concatenate([c.detections.points_vehicle for c in cycles]))
+    np.testing.assert_array_equal(found.pose, [cycle.pose for cycle in cycles])
+    np.testing.assert_array_equal(found.twist, np.tile([8.0, 0.0, 0.1], (24, 1)))
+
+
+@pytest.mark.parametrize("offset", [(2.0, 0.0), (0.0, 2.0), (1.4, -1.4)])
+def test_two_cones_two_metres_apart_stay_two(offset: tuple[float, float]) -> None:
+    """They are seen from 25 m on, where the gate is 1.5 m wide."""
+    cones = np.array([[25.0, 2.0], [25.0 + offset[0], 2.0 + offset[1]]])
+    found = follow(drive((8.0, 0.0, 0.0), 30, cones), NO_ERRORS)
+    assert counts(found) == [30, 30]
+    places = found.point + found.pose[:, :2]
+    for cone in (0, 1):
+        assert np.ptp(places[found.cone == cone], axis=0).max() < 1e-9
+
+
+def test_a_cone_that_was_long_out_of_sight_is_another_one() -> None:
+    cycles = drive((1.0, 0.0, 0.0), 60, np.array([[20.0, 2.0]]))
+    assert counts(follow([*cycles[:10], *cycles[35:]], NO_ERRORS)) == [35]
+    assert counts(follow([*cycles[:10], *cycles[45:]], NO_ERRORS)) == [10, 15]
+
+
+def with_errors(cycles: list[SeenCycle], errors: Array) -> list[SeenCycle]:
+    """Returns the cycles as a sensor with constant errors sees them: what is corrected is where it was."""
+    found = []
+    for cycle in cycles:
+        true = measured = cycle.detections.points_vehicle
+        for _ in range(30):
+            measured = true - by_sensor(measured, np.tile(cycle.twist, (len(true), 1))) @ errors
+        seen = Detections(cycle.detections.t, measured, cycle.detections.covariances, cycle.detections.labels)
+        found.append(SeenCycle(seen, cycle.pose, cycle.twist))
+    return found
+
+
+def test_with_known_errors_a_cone_keeps_its_number_from_afar_until_it_is_near() -> None:
+    """Stamps are 0.3 s late and ranges 12 % long, in a bend; a row of cones is seen twice a second."""
+    errors = np.array([0.03, 0.0, 0.3, 0.12, 0.0])
+    angle = np.linspace(0.25, 1.1, 7)
+    cones = np.column_stack([22.0 * np.sin(angle), 20.0 - 22.0 * np.cos(angle)])
+    exact = drive((10.0, 0.0, 0.5), 22, cones)[::5]
+    cycles = with_errors(exact, errors)
+    found, expected = follow(cycles, replace(NO_ERRORS, sensor=errors)), follow(exact, NO_ERRORS)
+    assert counts(found) == counts(expected)
+    np.testing.assert_array_equal(found.cone, expected.cone)
+    measured = np.concatenate([cycle.detections.points_vehicle for cycle in cycles])
+    seen = measured[np.hypot(*measured.T) < FOLLOW_RANGE]
+    np.testing.assert_array_equal(np.sort(found.point, axis=0), np.sort(seen, axis=0))
+
+
+def test_the_derivative_by_the_bias_of_the_yaw_rate_is_the_numeric_one() -> None:
+    """Poses by odometry whose yaw rate is corrected by a bias, at the cycles of a winding drive."""
+    rng, n, h = np.random.default_rng(0), 80, 1e-4
+    twists = np.column_stack(
+        [8.0 + np.cumsum(rng.normal(size=n)) * 0.1, 0.2 * np.ones(n), np.sin(np.arange(n) / 9.0)]
+    )
+
+    def poses(bias: float) -> Array:
+        # ten steps in each cycle: the cycles' own derivative is by the trapezium rule
+        return integrate(np.repeat(twists - [0.0, 0.0, bias], 10, axis=0), PERIOD / 10)[::10]
+
+    cones = np.array([[1.0, 0.5]])
+    at = poses(0.0)[:n]
+    seen = [SeenCycle(detections(PERIOD * k, cones, np.array([LEFT])), at[k], twists[k]) for k in range(n)]
+    found = follow(seen, NO_ERRORS)
+    assert len(found.t) == n
+    numeric = (poses(h) - poses(-h))[:n] / (2.0 * h)
+    np.testing.assert_allclose(found.by_bias[:, 2], numeric[:, 2], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.by_bias, numeric, atol=2e-3 * np.abs(numeric).max())
+
+
+# --- measured noise and errors --------------------------------------------------------------------------
 
 SEEDS = range(6)
 ERRORS = np.array([0.02, 0.1, 0.06, 0.05, 0.1])
@@ -123,19 +336,19 @@ def test_columns_are_derivatives_in_the_map_of_corrected_detections() -> None:
 
 def test_the_drive_itself_is_told_too() -> None:
     for one in found("white"):
-        np.testing.assert_allclose(one.odometry, WHITE, rtol=0.15)
+        np.testing.assert_allclose(one.odometry, SCENE_WHITE, rtol=0.15)
         assert one.interval == pytest.approx(0.02) and one.period == pytest.approx(0.1)
         assert 55.0 < one.seconds <= 60.0
         assert one.count >= 5 and one.per_cycle > 5.0
 
 
 def test_too_few_cones_say_nothing_of_the_sensor() -> None:
-    cycles, twists = CAMERAS["white"].drive(0)
-    some = measure_noise(cycles[:8], twists)
+    cycles, odometry = CAMERAS["white"].drive(0)
+    some = measure_noise(cycles[:8], odometry)
     assert some is not None and some.along is None and some.across is None
     assert np.isinf(some.sensor_sigma).all()
     assert len(cycles[0].detections.labels) < MIN_ROWS
-    assert measure_noise(cycles, TwistRecord()) is None
+    assert measure_noise(cycles, Odometry(np.zeros(0), np.zeros((0, 3)))) is None
 
 
 # --- simulated logs --------------------------------------------------------------------------------------
@@ -193,9 +406,9 @@ def test_a_biased_yaw_rate_is_not_taken_for_a_turned_sensor(bias: float) -> None
 
 
 def test_in_steps_it_is_the_same_and_none_is_long() -> None:
-    cycles, twists = CAMERAS["white"].drive(0)
-    whole = measure_noise(cycles, twists)
-    steps, parts = 0, begun(cycles, twists, None, of_lines=False)
+    cycles, odometry = CAMERAS["white"].drive(0)
+    whole = measure_noise(cycles, odometry)
+    steps, parts = 0, begun(cycles, odometry, None, of_lines=False)
     assert parts is not None and whole is not None
     while (found := parts.advance()) is None:
         steps += 1

@@ -194,21 +194,30 @@ def test_readings_that_never_change_are_believed_if_the_detections_agree() -> No
         np.testing.assert_allclose(motion.odometry.delta, [0.5, 0.0, 0.0], atol=1e-12)
 
 
-def past_cones(variance: float) -> tuple[MotionCheck, list[MeasuredMotion]]:
-    """A drive with exact detections, of which a variance (m^2) is claimed, and half a second of slip."""
-    rng, place, motions = np.random.default_rng(0), 0.0, []
-    cones = np.array([[x, side] for x in np.arange(0.0, 40.0, 3.0) for side in (-2.0, 2.5)])
+def past_cones(
+    factors: Array, seed: int = 0, variance: float = 0.01, *, noisy: bool = False
+) -> tuple[MotionCheck, list[MeasuredMotion], Array]:
+    """A drive past cones whose odometry reads `factors` (k, 10) times the speed; with the true steps (k,), m.
+
+    A variance (m^2) is claimed for the detections, which are exact or have it.
+    """
+    rng, place, motions = np.random.default_rng(seed), 0.0, []
+    steps = 0.5 + 0.1 * np.sin(np.arange(len(factors)) / 2.0)
+    cones = np.array([[x, side] for x in np.arange(0.0, steps.sum() + 15.0, 3.0) for side in (-2.0, 2.5)])
     cones += rng.uniform(-0.8, 0.8, cones.shape)
     check = MotionCheck(TwistNoise(np.array([0.1, 0.1, 0.01])), MotionSettings())
-    for k in range(40):
-        speed, slip = 5.0 + np.sin(0.5 * k), 2.5 if 20 <= k < 25 else 1.0
-        place += 0.1 * speed
+    for k, (step, factor) in enumerate(zip(steps, factors, strict=True)):
+        place += step
         seen = cones - [place, 0.0]
         seen = seen[(seen[:, 0] > 0.0) & (seen[:, 0] < 12.0)]
+        twists = np.column_stack([10.0 * step * factor + 1e-6 * np.arange(10), np.zeros((10, 2))])
+        if noisy:
+            seen += rng.normal(0.0, np.sqrt(variance), seen.shape)
+            twists += rng.normal(0.0, [0.1, 0.1, 0.01], twists.shape)
         claimed = np.tile(variance * np.eye(2), (len(seen), 1, 1))
         cycle = replace(_cycle(0.1 * (k + 1), seen), covariances=claimed)
-        motions.append(check.update(Odometry(np.array([0.1 * k]), np.array([[slip * speed, 0, 0]])), cycle))
-    return check, motions
+        motions.append(check.update(Odometry(0.1 * k + 0.01 * np.arange(10), twists), cycle))
+    return check, motions, steps
 
 
 def test_an_excess_of_four_is_that_of_covariances_four_times_as_large(
@@ -222,9 +231,10 @@ def test_an_excess_of_four_is_that_of_covariances_four_times_as_large(
         (scan_matching, "LARGE_MISFIT", 0.25),
     ):
         monkeypatch.setattr(module, name, value)
-    check, motions = past_cones(0.01)
+    slip = np.where((np.arange(40) >= 20) & (np.arange(40) < 25), 2.5, 1.0)[:, None] * np.ones(10)
+    check, motions, _ = past_cones(slip)
     monkeypatch.setattr(scan_matching, "LARGE_MISFIT", 1.5)
-    other, wide = past_cones(0.04)
+    other, wide, _ = past_cones(slip, variance=0.04)
     assert [motion.fault for motion in motions] == [motion.fault for motion in wide]
     assert any(motion.doubted for motion in motions)
     for motion, same in zip(motions, wide, strict=True):
@@ -236,22 +246,8 @@ def test_an_excess_of_four_is_that_of_covariances_four_times_as_large(
 
 def with_slip(seed: int, begins: float) -> tuple[list[MeasuredMotion], Array]:
     """Returns the motions of a noisy drive that slips from a share of cycle 20 on, and true ones (k,), m."""
-    rng, place, motions = np.random.default_rng(seed), 0.0, []
-    cones = np.array([[x, side] for x in np.arange(0.0, 40.0, 3.0) for side in (-2.0, 2.5)])
-    cones += rng.uniform(-0.8, 0.8, cones.shape)
-    check = MotionCheck(TwistNoise(np.array([0.1, 0.1, 0.01])), MotionSettings())
-    steps = 0.5 + 0.1 * np.sin(np.arange(24) / 2.0)
-    for k, step in enumerate(steps):
-        place += step
-        seen = cones - [place, 0.0]
-        seen = seen[(seen[:, 0] > 0.0) & (seen[:, 0] < 12.0)]
-        seen += rng.normal(0.0, 0.1, seen.shape)
-        twists = np.column_stack([np.full(10, 10.0 * step), np.zeros((10, 2))])
-        twists[k + np.arange(10) / 10.0 >= 20.0 + begins, 0] *= 2.5
-        twists += rng.normal(0.0, [0.1, 0.1, 0.01], twists.shape)
-        odometry = Odometry(0.1 * k + 0.01 * np.arange(10), twists)
-        motions.append(check.update(odometry, _cycle(0.1 * (k + 1), seen)))
-    return motions, steps
+    slips = np.arange(24)[:, None] + np.arange(10) / 10.0 >= 20.0 + begins
+    return past_cones(np.where(slips, 2.5, 1.0), seed, noisy=True)[1:]
 
 
 def test_a_slip_that_begins_between_two_cycles_is_in_the_covariance_of_what_takes_its_place() -> None:
@@ -280,31 +276,17 @@ def test_a_motion_by_detections_has_sigmas_for_the_estimator_that_uses_them_agai
     assert 0.15 < np.mean(squares) < 0.35
 
 
-def is_doubted_again(first: float, later: int) -> bool:
-    """Whether readings 25 % too high are contradicted so many cycles after half a second at `first` times."""
-    rng, place, doubted = np.random.default_rng(0), 0.0, []
-    cones = np.array([[x, side] for x in np.arange(0.0, 100.0, 3.0) for side in (-2.0, 2.5)])
-    cones += rng.uniform(-0.8, 0.8, cones.shape)
-    check = MotionCheck(TwistNoise(np.array([0.1, 0.1, 0.01])), MotionSettings())
-    for k in range(17 + later):
-        step = 0.5 + 0.1 * np.sin(k / 2.0)
-        place += step
-        seen = cones - [place, 0.0]
-        seen = seen[(seen[:, 0] > 0.0) & (seen[:, 0] < 12.0)]
-        factor = first if 10 <= k < 15 else 1.25 if k >= 15 + later else 1.0
-        twists = np.column_stack([10.0 * step * factor + 1e-6 * np.arange(10), np.zeros((10, 2))])
-        motion = check.update(Odometry(0.1 * k + 0.01 * np.arange(10), twists), _cycle(0.1 * (k + 1), seen))
-        doubted.append(motion.doubted)
-    return any(doubted[15 + later :])
-
-
 @pytest.mark.parametrize(
     ("first", "later", "doubted"), [(2.5, 20, True), (2.5, 100, True), (2.5, 130, False), (1.0, 20, False)]
 )
 def test_an_odometry_that_was_contradicted_is_doubted_earlier_for_12_s(
     first: float, later: int, doubted: bool
 ) -> None:
-    assert is_doubted_again(first, later) is doubted
+    """Readings are 25 % too high so many cycles after half a second at `first` times."""
+    k = np.arange(17 + later)
+    factors = np.where((k >= 10) & (k < 15), first, np.where(k >= 15 + later, 1.25, 1.0))
+    motions = past_cones(factors[:, None] * np.ones(10))[1]
+    assert any(motion.doubted for motion in motions[15 + later :]) is doubted
 
 
 def _cycle(t: float, points: Array) -> Detections:

@@ -14,8 +14,7 @@ from pathspace_graph.front_end import noise as noise_module
 from pathspace_graph.front_end.front_end import FrontEnd, judge_log, measure_log
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.io.log import Log
-from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.run import run_online, split_odometry
+from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
 
@@ -328,26 +327,8 @@ def test_noise_is_measured_after_8_s_of_driving_and_after_half_as_much_again_eac
         if front_end.noise.measured is not before:
             assert front_end.noise.measured is not None
             on.append(front_end.noise.measured.seconds)
+            np.testing.assert_array_equal(front_end._motion.noise.white, front_end.noise.measured.odometry)
     np.testing.assert_allclose(on, [8.0, 12.0, 18.0], atol=0.5)
-
-
-def test_a_mapper_that_measures_noise_never_reads_ahead() -> None:
-    """The poses up to the end of half a drive are those of the whole drive, to the bit."""
-    log = short_drive()
-    settings, half = replace(SETTINGS, noise="measured"), 2 * len(log.cycles) // 3
-    whole, part = ([result.pose for result in poses(one, settings)] for one in (log, cut(log, half)))
-    assert len(part) == half
-    np.testing.assert_array_equal(part, whole[:half])
-
-
-def poses(log: Log, settings: MapperSettings) -> list:  # type: ignore[type-arg]
-    """What a mapper says after each cycle, which has measured the noise in the end."""
-    mapper, found = FixedLagMapper(settings, log.noise), []
-    for odometry, cycle in split_odometry(log):
-        mapper.wait()
-        found.append(mapper.update(odometry, cycle))
-    assert mapper.front_end.noise.measured is not None
-    return found
 
 
 def test_stated_noise_stays_unless_errors_stay() -> None:
@@ -358,14 +339,6 @@ def test_stated_noise_stays_unless_errors_stay() -> None:
         known = learner(replace(noise(), along=ray, across=ray), cones=True)
         assert (ray.inflation(20, 0.1) < 1.5**2) == same
         assert (known.for_map(seen).covariances is seen.covariances) == same
-
-
-def test_stated_noise_is_not_touched_by_what_a_drive_shows() -> None:
-    """Where that is asked for, a log is mapped the same whatever is in its measurement."""
-    log, settings = cut(short_drive(), 80), replace(SETTINGS, noise="stated")
-    other = replace(log, measured=noise(ERRORS))
-    maps = [run_online(one, FixedLagMapper(settings, one.noise)).trajectory for one in (log, other)]
-    np.testing.assert_array_equal(*maps)
 
 
 def test_a_whole_log_is_measured_before_it_is_judged() -> None:

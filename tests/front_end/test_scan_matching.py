@@ -116,12 +116,6 @@ def test_a_detection_of_nothing_has_no_say() -> None:
     np.testing.assert_allclose(found.pose, [0.5, 0.0, 0.0], atol=1e-3)
 
 
-def test_one_cone_holds_no_motion() -> None:
-    one, seen = seen_once(CONES[:1]), Seen(CONES[:1], np.full(1, 0.01))
-    assert one.has(seen, np.zeros(3)).all()
-    assert one.match(seen, np.zeros(3), REACHES) is None
-
-
 def test_detections_of_one_cone_alone_hold_no_motion_however_many_they_are() -> None:
     """All offsets have the same arm, so that the information is singular."""
     points = np.tile(CONES[:1], (5, 1))

@@ -107,15 +107,6 @@ def test_errors_may_change_as_much_in_a_minute_as_the_settings_say() -> None:
     np.testing.assert_allclose(known.covariance, np.diag(expected))
 
 
-def test_an_old_latency_is_forgotten_so_that_a_new_one_is_learned() -> None:
-    rng, known, spread = np.random.default_rng(1), SensorErrors(SETTINGS), np.diag([0.05, 0.05, 0.005]) ** 2
-    for cycle in range(9_000):
-        truth = np.array([0.0, 0.0 if cycle < 7_500 else 0.03])
-        shifts = known.shifts(np.array([1.0, 0.0]), np.array([*rng.normal(scale=0.5, size=2), 0.1]))
-        known.update(shifts @ (truth - known.mean), spread, shifts, scan_matching.SCAN_MEMORY)
-    assert known.mean[1] == pytest.approx(0.03, abs=0.003)
-
-
 # --- whole drives ----------------------------------------------------------------------------------------
 
 

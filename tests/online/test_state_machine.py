@@ -266,7 +266,7 @@ class Cycles(RuleBasedStateMachine):
 
     @rule()
     def the_same_cycle_again(self) -> None:
-        if self.estimator.front_end._motion.newest.t == self.t:
+        if self.estimator.front_end._motion.t == self.t:
             self.refuse(NO_TWISTS, see(self.t, self.pose, CONES, LABELS))
 
     @rule()
@@ -285,7 +285,7 @@ class Cycles(RuleBasedStateMachine):
 
     @property
     def estimator_is_new(self) -> bool:
-        return self.estimator.front_end._motion.newest.t is None
+        return self.estimator.front_end._motion.t is None
 
     # --- what always holds -----------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
-from pathspace_graph.front_end.sightings import TwistRecord
+from pathspace_graph.front_end.measurement import twist_noise
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.io.overrides import override
 from pathspace_graph.labels import KINDS, LEFT, RIGHT, UNKNOWN, Kind
@@ -352,10 +352,9 @@ def test_rough_motion_does_not_count_as_noise() -> None:
     t = 0.1 * np.arange(300)
     twists = np.column_stack([5.0 + np.sin(2.0 * t), 0.0 * t, 0.3 * np.cos(3.0 * t)])
     log = replace(short_drive(), odometry=Odometry(t, twists), odometry_sigma=np.full(3, 1e-4))
-    record = TwistRecord()
-    record.add(log.odometry)
-    orders = record.orders()
-    assert orders is not None
+    found = twist_noise(log.odometry)
+    assert found is not None
+    orders = found[0]
     assert (orders[:, 0].max() > 2.0 * orders[:, 0].min()) and orders[:, 0].min() > 1.5e-4
     assert not any(hint.cause == "noise" and hint.file == "log.toml" for hint in hints(log))
 
