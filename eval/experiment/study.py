@@ -37,8 +37,6 @@ PRESET: Final = "preset"  # entry of a noise that names a preset, as in `sensor.
 ALL: Final = "all"  # name that stands for all known estimators
 RECORDED: Final = "recorded"  # noise of a drive that was not simulated
 TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
-RESOLUTION: Final = 1e-3  # length (m) and angle (rad) to which the geometry of a track identifies it
-ROUNDING: Final = 1.0 / np.pi  # shift that keeps coordinates of few decimals off the edges of millimetres
 _LISTS: Final = ("tracks", "seeds", "estimators", "metrics")
 _latest: dict[str, tuple[Log, Sequence[Hint]]] = {}  # the log that was asked for last, by its drive
 
@@ -47,7 +45,7 @@ _latest: dict[str, tuple[Log, Sequence[Hint]]] = {}  # the log that was asked fo
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class StudyDrive:
     """A log that is simulated or recorded, as a study names it."""
 
     track: str
@@ -69,26 +67,22 @@ class Drive:
         return _latest[self.id]
 
 
-def simulated_drive(track: Track, seed: int, noise: str, simulation: SimulationSettings) -> Drive:
+def simulated_drive(track: Track, seed: int, noise: str, simulation: SimulationSettings) -> StudyDrive:
     """Return a drive whose seed depends on the track: those of several tracks are independent samples."""
     digest = track_digest(track)
     own = int(identity(track=digest, seed=seed)[:8], 16)
     meaning = identity(track=digest, seed=own, simulation=asdict(simulation))
-    read = partial(_simulated, track, simulation, own)
-    return Drive(track.name, seed, noise, str(own), meaning, read, simulation)
+    names = track.name, seed, noise, str(own), meaning
+    return StudyDrive(*names, lambda: (simulate(track, simulation, own), ()), simulation)
 
 
-def _simulated(track: Track, simulation: SimulationSettings, seed: int) -> tuple[Log, Sequence[Hint]]:
-    return simulate(track, simulation, seed), ()
-
-
-def recorded_drive(track: str, number: int, folder: Path, limits: LimitSettings) -> Drive:
+def recorded_drive(track: str, number: int, folder: Path, limits: LimitSettings) -> StudyDrive:
     """Return the drive of a log's folder, one of those that were driven on a track."""
     digest = hashlib.sha256()
     for file in (folder / name for name in FILES):
         digest.update(file.name.encode() + (file.read_bytes() if file.exists() else b""))
     read = partial(read_plausible_log, folder, limits)
-    return Drive(track, number, RECORDED, folder.resolve().name, digest.hexdigest()[:20], read)
+    return StudyDrive(track, number, RECORDED, folder.resolve().name, digest.hexdigest()[:20], read)
 
 
 def track_digest(track: Track) -> str:
@@ -97,7 +91,8 @@ def track_digest(track: Track) -> str:
     The last digits of a generated track depend on the processor; the seeds of its drives do not.
     """
     parts = (track.left, track.right, track.other, track.start, track.cone_labels)
-    rounded = (np.floor(np.asarray(part) / RESOLUTION + ROUNDING).astype("<i8") for part in parts)
+    # the shift keeps coordinates of few decimals off the edges of millimetres
+    rounded = (np.floor(np.asarray(part) / 1e-3 + 1.0 / np.pi).astype("<i8") for part in parts)
     cones = b"|".join(part.tobytes() for part in rounded)
     return hashlib.sha256(cones + str(track.closed).encode()).hexdigest()[:20]
 

@@ -28,7 +28,6 @@ from pathspace_graph.eval.benchmark import (
     ROAD_WIDTH,
     SPEED,
     ToldLandmarks,
-    chosen,
     closed_road,
     measure_scaling,
     open_road,
@@ -91,12 +90,6 @@ def test_updates_have_as_many_detections_and_laps_as_they_say() -> None:
     assert {*at[~np.isnan(at)]} == {1.0, 2.0}
     ((log, at),) = sweep_drives(DENSE_LINE, SMALL)
     assert np.mean([len(cycle.labels) for cycle in log.cycles]) == pytest.approx(LINE_POINTS, rel=0.1)
-
-
-def test_detections_are_chosen_by_the_seed() -> None:
-    first, again = (chosen(20, 4, np.random.default_rng(0)) for _ in range(2))
-    assert first.sum() == 4 and (first == again).all()
-    assert chosen(3, 4, np.random.default_rng(0)).all()
 
 
 class Pretender:

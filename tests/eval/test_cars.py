@@ -118,7 +118,7 @@ def test_there_is_a_row_for_each_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of four drives there are four maps of one, two of two, and one of all."""
     monkeypatch.setattr("pathspace_graph.eval.cars.metrics_of_group", lambda logs, _: {"logs": [*logs]})
     monkeypatch.setattr("pathspace_graph.eval.cars.solve_alone", lambda log: log)
-    monkeypatch.setattr("pathspace_graph.eval.cars.drive", lambda car, track, seed: seed)
+    monkeypatch.setattr("pathspace_graph.eval.cars.simulated", lambda car, track, seed: seed)
     rows = joint_of_track("plain", 4, 4)
     assert [row["drives"] for row in rows] == [1, 1, 1, 1, 2, 2, 4]
     assert [row["logs"] for row in rows[4:]] == [["0", "1"], ["2", "3"], ["0", "1", "2", "3"]]

@@ -173,12 +173,6 @@ def test_a_file_that_is_wrong_is_named(tmp_path: Path) -> None:
     assert read_study_file(file).name == "mine"
 
 
-def test_a_missing_track_names_the_nearest_file(tmp_path: Path) -> None:
-    (tmp_path / "oval.csv").write_text("")
-    with pytest.raises(InputError, match=r"ovel.csv.*the nearest is 'oval.csv'"):
-        load_tracks((tmp_path / "ovel.csv",))
-
-
 def test_a_study_is_found_by_name_or_refused_with_the_nearest() -> None:
     assert find_study(Path("degree")) == SHIPPED / "degree.toml"
     with pytest.raises(SettingsError, match="the nearest is 'degree'"):
