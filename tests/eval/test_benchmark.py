@@ -72,8 +72,16 @@ def test_roads_have_their_gaps_and_width_and_never_come_near_themselves(track: A
     assert np.all(np.minimum(apart, len(track.left) - apart if track.closed else apart) < 6)
 
 
-def test_the_long_drive_ends_when_the_last_cone_is_seen() -> None:
+def test_the_long_drive_ends_when_the_last_cone_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is detected of no cone does not count."""
+    drives = list[Log]()
+    monkeypatch.setattr(benchmark, "simulate", lambda *given: drives.append(simulate(*given)) or drives[-1])
     ((log, at),) = sweep_drives(CONES, SMALL)
+    truth, detected = drives[0].truth, np.cumsum([len(cycle.labels) for cycle in log.cycles])
+    assert truth is not None and truth.associations is not None
+    cones = [{*truth.associations[:count].tolist()} for count in detected[-2:]]
+    assert -1 in cones[-1]
+    assert len(cones[0] - {-1}) < SMALL.cones_max <= len(cones[1] - {-1})
     ((whole, _),) = sweep_drives(CONES, ScalingSettings(cones_min=20.0, cones_max=60.0, bins=1))
     assert len(at) == len(log.cycles) == len(whole.cycles)
     middles = 20.0 * (61.0 / 20.0) ** ((np.arange(4) + 0.5) / 4)  # of four intervals from 20 to 61 cones

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial import KDTree
 
 from pathspace_graph.eval.cars import (
     OTHER,
@@ -52,10 +53,12 @@ def test_a_drive_that_begins_later_has_what_came_then_and_no_truth() -> None:
 def test_of_a_surveyed_map_some_neighbours_on_the_left_stood_elsewhere() -> None:
     truth, track = truth_of(LOG), to_map_frame(pear_track())
     curves = surveyed(truth, np.random.default_rng(1), moved=7).splines
-    off = {
-        label: np.abs(curves[label].foot_points(cones).distance)
-        for label, cones in ((LEFT, track.left), (RIGHT, track.right))
+    feet = {
+        label: curves[label].foot_points(cones) for label, cones in ((LEFT, track.left), (RIGHT, track.right))
     }
+    off, right = {label: np.abs(foot.distance) for label, foot in feet.items()}, KDTree(track.right)
+    moved = off[LEFT] > 1.0
+    assert (right.query(feet[LEFT].position[moved])[0] > right.query(track.left[moved])[0]).all(), "outwards"
     assert 4 <= (off[LEFT] > 1.0).sum() <= 9
     assert off[LEFT].max() < 3.5
     assert off[RIGHT].max() < 0.6
