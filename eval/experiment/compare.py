@@ -183,8 +183,22 @@ def write_comparison(out: Path, comparison: Comparison, jobs: int, *, force: boo
             table.write(folder, name, "md", "tex")
         for name, frame in frames.items():
             write_csv(folder / f"{name}.csv", frame)
-        for log in study.logs:
-            _write_log(folder if len(study.logs) == 1 else folder / log, log, comparison)
+        for log in study.logs:  # with the files of its runs, and their maps in one picture
+            place = folder if len(study.logs) == 1 else folder / log
+            drawn, truth = dict[str, tuple[Map, Array]](), None
+            place.mkdir(exist_ok=True)
+            for cell, record in comparison.results:
+                if cell.drive.track != log or record["failure"]:
+                    continue
+                run = shutil.copytree(run_folder(comparison.folder, cell), place / cell.estimator)
+                file = next(run / name for name in (SMOOTHED_FILE, TRAJECTORY_FILE) if (run / name).exists())
+                whole = record["rows"][-1]
+                known = [metric for metric in PAPER if whole.get(metric.key) is not None]
+                texts = [f"{m.title} {m.text(whole[m.key])} {m.unit}".strip() for m in known]
+                drawn[f"{cell.estimator}\n{', '.join(texts)}"] = read_map(run), read_trajectory(file)[1]
+                truth = cell.drive.load()[0].truth
+            if drawn:
+                save_figures(place, {"maps": plot_maps(drawn, truth)})
         about = {
             "format": "pathspace-comparison/1",
             "logs": [*study.logs],
@@ -195,20 +209,3 @@ def write_comparison(out: Path, comparison: Comparison, jobs: int, *, force: boo
             "versions": versions(),
         }
         write_json(folder / MARKER, about)
-
-
-def _write_log(folder: Path, name: str, comparison: Comparison) -> None:
-    """Copy the files of the runs on a log, and draw their maps."""
-    folder.mkdir(exist_ok=True)
-    drawn, truth = dict[str, tuple[Map, Array]](), None
-    for cell, record in comparison.results:
-        if cell.drive.track != name or record["failure"]:
-            continue
-        run = shutil.copytree(run_folder(comparison.folder, cell), folder / cell.estimator)
-        file = next(run / name for name in (SMOOTHED_FILE, TRAJECTORY_FILE) if (run / name).exists())
-        known = [metric for metric in PAPER if record["rows"][-1].get(metric.key) is not None]
-        texts = [f"{m.title} {m.text(record['rows'][-1][m.key])} {m.unit}".strip() for m in known]
-        drawn[f"{cell.estimator}\n{', '.join(texts)}"] = read_map(run), read_trajectory(file)[1]
-        truth = cell.drive.load()[0].truth
-    if drawn:
-        save_figures(folder, {"maps": plot_maps(drawn, truth)})

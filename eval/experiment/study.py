@@ -122,23 +122,23 @@ def load_tracks(tracks: Iterable[Path | int]) -> list[Track]:
             every += files
         else:
             raise InputError(entry, f"expected track files ({', '.join(TRACK_SUFFIXES)}), found none")
-    stems = [track.stem for track in every if isinstance(track, Path)]
-    return [_load(track, stems) for track in every]
-
-
-def _load(track: Path | int, stems: list[str]) -> Track:
-    if isinstance(track, int):
-        return replace(generate_track(np.random.default_rng(track)), name=f"generated {track}")
-    if track.name in EVENTS and not track.exists():
-        return EVENTS[track.name]()
-    if not track.exists() and track.parent.is_dir():
-        beside = sorted(entry.name for entry in track.parent.iterdir() if entry.suffix == track.suffix)
-        try:
-            check_name(track.name, beside, "expected a track file")
-        except SettingsError as error:
-            raise InputError(track, str(error)) from error
-    folder = f"{track.resolve().parent.name}/" if stems.count(track.stem) > 1 else ""
-    return replace(read_track(track), name=f"{folder}{track.stem}")
+    stems, found = [track.stem for track in every if isinstance(track, Path)], list[Track]()
+    for track in every:
+        if isinstance(track, int):
+            generated = generate_track(np.random.default_rng(track))
+            found.append(replace(generated, name=f"generated {track}"))
+        elif track.name in EVENTS and not track.exists():
+            found.append(EVENTS[track.name]())
+        else:
+            if not track.exists() and track.parent.is_dir():
+                beside = sorted(one.name for one in track.parent.iterdir() if one.suffix == track.suffix)
+                try:
+                    check_name(track.name, beside, "expected a track file")
+                except SettingsError as error:
+                    raise InputError(track, str(error)) from error
+            folder = f"{track.resolve().parent.name}/" if stems.count(track.stem) > 1 else ""
+            found.append(replace(read_track(track), name=f"{folder}{track.stem}"))
+    return found
 
 
 # --- studies -----------------------------------------------------------------------------------------------
@@ -379,7 +379,17 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
         check_name(key, _KINDS, "expected a known key")
         values[key] = _typed(key, [ALL] if given == ALL and key in _LISTS else given, _KINDS[key])
     values["tracks"] = [folder / t if isinstance(t, str) else t for t in values.get("tracks", ())]
-    values["logs"] = _logs(values.pop("drives", {}), folder)
+    drives = values.pop("drives", {})
+    for key in drives:
+        check_name(key, ("logs",), "drives: expected a known key")
+    given = drives.get("logs", [])
+    several = given if isinstance(given, Mapping) else {"": given}
+    values["logs"] = {}  # from a list each is of a track of its own, from a table of that of its list
+    for track, paths in several.items():
+        key = f"drives.logs.{track}".rstrip(".")
+        own = [folder / _typed(key, path, str) for path in _typed(key, paths, list)]
+        logs = tuple(log for path in own for log in log_folders(path).values())
+        values["logs"] |= {track: logs} if isinstance(given, Mapping) else {log.name: (log,) for log in logs}
     given = flatten(values.get("settings", {}))
     overrides, values["own"] = apart(given, registry.known_estimators(), MapperSettings())
     values["settings"] = override(MapperSettings(), overrides, "settings")
@@ -398,21 +408,6 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
     except msgspec.ValidationError as error:
         raise SettingsError(f"published: {error}") from error
     return Study(**values | {"baseline": Baseline(**baseline)})
-
-
-def _logs(drives: Mapping[str, Any], folder: Path) -> dict[str, tuple[Path, ...]]:
-    """Return logs by their track: from a list, each of a track of its own, or from a table of lists."""
-
-    def paths(key: str, values: Any) -> tuple[Path, ...]:
-        given = [folder / _typed(key, value, str) for value in _typed(key, values, list)]
-        return tuple(log for path in given for log in log_folders(path).values())
-
-    for key in drives:
-        check_name(key, ("logs",), "drives: expected a known key")
-    logs = drives.get("logs", [])
-    if isinstance(logs, Mapping):
-        return {track: paths(f"drives.logs.{track}", own) for track, own in logs.items()}
-    return {log.name: (log,) for log in paths("drives.logs", logs)}
 
 
 def _typed(key: str, value: Any, kind: type) -> Any:
