@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 import tomllib
 from dataclasses import replace
@@ -315,6 +316,7 @@ def test_a_drive_is_the_same_by_geometry_seed_and_simulation_whatever_its_names(
     assert simulated_drive(renamed, 0, "quiet", two).id == drive.id
     assert simulated_drive(track, 1, "nominal", two).id != drive.id
     assert simulated_drive(track, 0, "nominal", three).id != drive.id
+    assert pickle.loads(pickle.dumps(drive)).id == drive.id, "it is an argument of cells"
 
 
 def test_the_last_digits_of_a_track_do_not_matter_to_its_drives_and_a_centimetre_does() -> None:
