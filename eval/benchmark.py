@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from pathspace_graph.console import progress
 from pathspace_graph.estimators import make_online
-from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.se2 import compose, left_of, to_map
 from pathspace_graph.io.files import atomic_folder, write_json
@@ -39,7 +39,7 @@ from pathspace_graph.sim.vehicle import VehicleSettings
 
 from .experiment.provenance import code_of
 from .experiment.run import rows_of
-from .experiment.tables import Table, write_csv
+from .experiment.tables import TextTable, write_csv
 from .figures import style
 from .metrics.accuracy import mean_of
 from .metrics.measures import UNKNOWN, Metric, figure, figures
@@ -163,15 +163,10 @@ def speed_on(log: Log, settings: MapperSettings) -> dict[str, float]:
 
 CONES, READINGS, LAPS, DENSE_LINE = "cones", "readings", "laps", "line"
 """Varied: cones seen, detections of an update, or lap. On a line, 300 points in each update."""
-GAP, DENSE_GAP, DENSE_RANGE = 5.0, 1.0, 30.0  # distances of cones in a row, and dense with its range (m)
+GAP, DENSE_RANGE = 5.0, 30.0  # distance of cones in a row, and range of a dense sensor (m)
 LINE_POINTS: Final = 300  # points of both lines in a cycle, in the mean
-LINE_SPACING: Final = 0.2  # distance of a cycle's points along each line, which gives that many (m)
 ROAD_WIDTH: Final = 4.0  # distance of the rows (m)
-SWING, WAVELENGTH = 0.9, 300.0  # largest turn from a road's direction (rad), and length of a swing (m)
-DENT, DENTS = 0.12, 3  # share of the radius by which a closed road leaves its circle, and how often it does
-DRIVEN, LATERAL = 20.0, 9.0  # speed of the vehicle (m/s) and its largest lateral acceleration (m/s^2)
 STEP: Final = 0.25  # distance of the samples of a road's middle (m)
-SPARE: Final = 1.1  # cones of an open road by those to be seen, since some are never detected
 SEED: Final = 1  # of the drives and of the choice of detections
 JUDGED: Final = 10  # number of updates whose mean is compared with the budget
 QUICK: Final = ScalingSettings(  # takes less than a minute; its slopes mean little
@@ -190,18 +185,18 @@ QUICK: Final = ScalingSettings(  # takes less than a minute; its slopes mean lit
 def open_road(cones: int, gap: float) -> Track:
     """Return a winding road that never comes near itself, on which at least `cones` cones can be seen.
 
-    Its heading is `SWING * sin(2 pi s / WAVELENGTH)` at the length s along it; cones are `gap` (m) apart.
+    Its heading (rad) is `0.9 sin(2 pi s / 300 m)` at the length s along it; cones are `gap` (m) apart.
     """
-    s = np.arange(0.0, SPARE * cones / 2 * gap, STEP)
-    heading = SWING * np.sin(2 * np.pi * s / WAVELENGTH)
+    s = np.arange(0.0, 1.1 * cones / 2 * gap, STEP)  # a tenth more, since some are never detected
+    heading = 0.9 * np.sin(2 * np.pi * s / 300.0)
     middle = STEP * np.cumsum(np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
     return _with_rows(middle, gap, closed=False)
 
 
 def closed_road(cones: int) -> Track:
-    """Return a dented circle with about `cones` cones: `r = 1 + DENT cos(DENTS phi)`, scaled."""
+    """Return a dented circle with about `cones` cones: `r = 1 + 0.12 cos(3 phi)`, scaled."""
     phi = np.linspace(0.0, 2 * np.pi, max(int(cones * GAP / STEP), 100))
-    r = 1.0 + DENT * np.cos(DENTS * phi)
+    r = 1.0 + 0.12 * np.cos(3 * phi)
     unscaled = r[:, None] * np.column_stack([np.cos(phi), np.sin(phi)])
     return _with_rows(unscaled * (cones / 2 * GAP / arc_lengths(unscaled)[-1]), GAP, closed=True)
 
@@ -227,23 +222,31 @@ def sweep_drives(sweep: str, settings: ScalingSettings) -> list[tuple[Log, Array
     """
 
     def drive(track: Track, laps: int = 1, **sensing: Any) -> Log:
-        vehicle = VehicleSettings(speed_max=DRIVEN, speed_start=DRIVEN, acceleration_lateral=LATERAL)
+        vehicle = VehicleSettings(speed_max=20.0, speed_start=20.0, acceleration_lateral=9.0)
         return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, **sensing), SEED)
 
     if sweep == CONES:
         log = drive(open_road(int(settings.cones_max), GAP))
-        seen = cones_seen(log)
+        assert log.truth is not None
+        assert log.truth.associations is not None
+        ends = np.cumsum([len(cycle.labels) for cycle in log.cycles])
+        cones, first = np.unique(log.truth.associations, return_index=True)
+        seen = np.searchsorted(np.sort(first[cones >= 0]), ends)  # number of cones by the end of each cycle
         edges = np.geomspace(CONES_MIN, settings.cones_max + 1.0, settings.bins + 1)
         middles = np.concatenate([[np.nan], np.sqrt(edges[:-1] * edges[1:]), [np.nan]])
         count = int(np.searchsorted(seen, settings.cones_max)) + 1
         until_seen = replace(log, cycles=log.cycles[:count], truth=None)
         return [(until_seen, middles[np.searchsorted(edges, seen[:count], side="right")])]
     if sweep == READINGS:
-        road, rng = open_road(settings.readings_cones, DENSE_GAP), np.random.default_rng(SEED)
+        road, rng = open_road(settings.readings_cones, 1.0), np.random.default_rng(SEED)
         dense, drives = drive(road, sensor=SensorSettings(range_max=DENSE_RANGE)), list[tuple[Log, Array]]()
         for wanted in settings.readings:
-            cycles = [seen.where(chosen(len(seen.labels), wanted, rng)) for seen in dense.cycles]
-            counts = np.array([len(seen.labels) for seen in cycles])
+            cycles = list[Detections]()
+            for detected in dense.cycles:  # as many at random, or all where there are fewer
+                size = len(detected.labels)
+                kept = rng.choice(size, min(wanted, size), replace=False)
+                cycles.append(detected.where(np.isin(np.arange(size), kept)))
+            counts = np.array([len(detected.labels) for detected in cycles])
             counted = (counts == wanted) & (np.arange(len(cycles)) >= settings.warm_up)
             log = replace(dense, cycles=tuple(cycles), truth=None)
             drives.append((log, np.where(counted, float(wanted), np.nan)))
@@ -253,22 +256,9 @@ def sweep_drives(sweep: str, settings: ScalingSettings) -> list[tuple[Log, Array
         log = drive(closed, settings.laps)
         lap = 1.0 + np.searchsorted(lap_times(log), [seen.t for seen in log.cycles])
         return [(log, np.where(lap <= settings.laps, lap, np.nan))]
-    log = drive(closed, 2, sensor=replace(LINE, range_max=DENSE_RANGE), line=LineSettings(LINE_SPACING))
+    # a spacing (m) that gives so many points
+    log = drive(closed, 2, sensor=replace(LINE, range_max=DENSE_RANGE), line=LineSettings(0.2))
     return [(log, np.full(len(log.cycles), float(LINE_POINTS)))]
-
-
-def cones_seen(log: Log) -> IntArray:
-    """Return the number of true cones that had been detected by the end of each cycle (n,)."""
-    assert log.truth is not None
-    assert log.truth.associations is not None
-    ends = np.cumsum([len(seen.labels) for seen in log.cycles])
-    seen, first = np.unique(log.truth.associations, return_index=True)
-    return np.searchsorted(np.sort(first[seen >= 0]), ends, side="left")
-
-
-def chosen(size: int, count: int, rng: np.random.Generator) -> BoolArray:
-    """Return which (size,) of some detections are kept: `count` at random, or all where there are fewer."""
-    return np.asarray(np.isin(np.arange(size), rng.choice(size, min(count, size), replace=False)))
 
 
 def update_times(
@@ -360,7 +350,7 @@ def seconds_at(points: pd.DataFrame, cones: float) -> float:
     return float(np.exp(np.interp(np.log(cones), at, seconds, left=np.nan, right=np.nan)))
 
 
-def scaling_table(points: pd.DataFrame, settings: ScalingSettings) -> Table:
+def scaling_table(points: pd.DataFrame, settings: ScalingSettings) -> TextTable:
     """Return a row for each estimator: slopes with standard errors, times, the ratio to the first."""
     names, laps = [*points["estimator"].unique()], [*dict.fromkeys((2, settings.laps))]
     header = (
@@ -381,7 +371,7 @@ def scaling_table(points: pd.DataFrame, settings: ScalingSettings) -> Table:
         values += [milliseconds.get(place, math.nan) for place in places]
         both = (slopes.get((sweep, name), UNKNOWN) for sweep in (CONES, READINGS))
         rows.append((name, *both, *figures(values, 1, 2, 0, *[1] * len(places))))
-    return Table.of(header, rows, "Time per update: slopes of the logarithms, ± standard error")
+    return TextTable.of(header, rows, "Time per update: slopes of the logarithms, ± standard error")
 
 
 def write_scaling(

@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 from scipy.special import expit
 
-from pathspace_graph import estimators as registry
 from pathspace_graph.batch.joint import join
 from pathspace_graph.batch.known_map import KnownMap, map_of_cones
 from pathspace_graph.batch.mapper import BatchResult
@@ -40,7 +39,7 @@ from pathspace_graph.sim.track_generator import generate_track
 
 from .experiment.run import CELLS, run_study
 from .experiment.study import Study
-from .experiment.tables import Table, by_name, estimate, last_laps
+from .experiment.tables import TextTable, by_name, estimate, last_laps
 from .metrics.accuracy import lap_metrics, root_mean_square
 from .metrics.alignment import aligned_distance, end_by_registration, maps_apart, motion_onto, shape_rmse
 from .metrics.consistency import consistency_at_cones, map_nees
@@ -63,26 +62,18 @@ def on_tracks(
     return [{"car": car, "track": track, **same} for track in tracks for car in cars]
 
 
-def drive(car: str, track: int, seed: int) -> Log:
+def simulated(car: str, track: int, seed: int) -> Log:
     """Return a drive of a car on the generated track of a number."""
     return simulate(generate_track(np.random.default_rng(track)), CARS[car], seed)
 
 
 # --- known maps --------------------------------------------------------------------------------------------
 
-OWN, SURVEYED, MOVED, OTHER = "another drive's", "surveyed", "surveyed, 7 cones moved", "another track's"
+OWN, OTHER = "another drive's", "another track's"
 SIGMA_SURVEY: Final = 0.15  # of the cones of a surveyed map (m)
-MOVED_CONES, MOVED_BY = 7, 2.5  # number of neighbours on the left that were moved, and how far (m)
 SOON: Final = 8.0  # time after which the vehicle should be found (s)
 DRIVEN: Final = 40.0  # time that is driven on a known map (s)
 WRONG: Final = 2.0  # distance (m) from the true pose at which the place where it was found is a wrong one
-KNOWN: Final = (
-    Metric("found", "found", "%", 0),
-    Metric("soon", f"within {SOON:.0f} s", "%", 0),
-    Metric("wrong", "at a wrong place", "%", 0),
-    Metric("error", "pose error", "m", 2),
-    Metric("map", "rmse of the map", "m", 2),
-)
 
 
 def known_of_track(car: str, track: int, begins: Sequence[float]) -> list[dict[str, Any]]:
@@ -90,15 +81,15 @@ def known_of_track(car: str, track: int, begins: Sequence[float]) -> list[dict[s
 
     It begins at some shares of the first lap's time.
     """
-    first, second = (drive(car, track, seed) for seed in (0, 1))
+    first, second = (simulated(car, track, seed) for seed in (0, 1))
     truth, rows = truth_of(first), list[dict[str, Any]]()
     motion = motion_onto(truth_of(second).cones, truth.cones)
     rng = np.random.default_rng(track)
     maps = {
         OWN: mapped(first),
-        SURVEYED: surveyed(truth, rng),
-        MOVED: surveyed(truth, rng, MOVED_CONES),
-        OTHER: mapped(drive(car, track + 1000, 0)),
+        "surveyed": surveyed(truth, rng),
+        "surveyed, 7 cones moved": surveyed(truth, rng, 7),
+        OTHER: mapped(simulated(car, track + 1000, 0)),
     }
     for kind, known in maps.items():
         rmse = np.nan if kind == OTHER else lap_metrics(known, truth, 0).rmse
@@ -114,7 +105,7 @@ def mapped(log: Log) -> Map:
 
 
 def surveyed(truth: Truth, rng: np.random.Generator, moved: int = 0) -> Map:
-    """Return the map of surveyed cones, before `moved` neighbours on the left were put elsewhere."""
+    """Return the map of surveyed cones, before `moved` neighbours on the left were put 2.5 m outwards."""
     rows = {label: truth.cones[truth.cone_labels == label] for label in (LEFT, RIGHT)}
     cones = {label: row + SIGMA_SURVEY * rng.normal(size=row.shape) for label, row in rows.items()}
     begin = int(rng.integers(len(cones[LEFT])))
@@ -122,7 +113,7 @@ def surveyed(truth: Truth, rng: np.random.Generator, moved: int = 0) -> Map:
     middle = np.array([cones[RIGHT][np.hypot(*(cones[RIGHT] - c).T).argmin()] for c in cones[LEFT][chosen]])
     if moved:
         outwards = cones[LEFT][chosen] - middle
-        cones[LEFT][chosen] += MOVED_BY * outwards / np.hypot(*outwards.T)[:, None]
+        cones[LEFT][chosen] += 2.5 * outwards / np.hypot(*outwards.T)[:, None]
     return map_of_cones(cones[LEFT], cones[RIGHT], True, SIGMA_SURVEY)
 
 
@@ -149,32 +140,34 @@ def drive_on(known: Map, log: Log, share: float, motion: Array) -> dict[str, Any
     return {"found": 1.0, "soon": soon, "wrong": wrong, "error": root_mean_square(away)}
 
 
-def known_table(frame: pd.DataFrame) -> Table:
+def known_table(frame: pd.DataFrame) -> TextTable:
     """Return a row for each car and kind of map."""
     count = frame.groupby(["car", "kind"])["track"].transform("size").astype(str)
     named = {"cars": frame["car"], "known map": frame["kind"] + " (" + count + " drives)"}
-    return by_name(frame.assign(**named), [*named], KNOWN)
-
-
-SEARCH_INTERVAL: Final = 10.0  # distance from one search to the next (m)
-FIRST_SEARCH: Final = 20.0  # path before the first one (m)
-ODDS: Final = (-100.0, 0.0, 2.0, 4.0, SURE_ODDS, 10.0, 15.0, 100.0)  # edges of the rows of claimed log odds
+    metrics = (
+        Metric("found", "found", "%", 0),
+        Metric("soon", f"within {SOON:.0f} s", "%", 0),
+        Metric("wrong", "at a wrong place", "%", 0),
+        Metric("error", "pose error", "m", 2),
+        Metric("map", "rmse of the map", "m", 2),
+    )
+    return by_name(frame.assign(**named), [*named], metrics)
 
 
 def odds_of_track(car: str, track: int) -> list[dict[str, Any]]:
     """Return a row for each search of the second drive of a track, on its own map and on another track's.
 
-    Each knows only the path and the detections of the last metres.
+    There is one every 10 m from 20 m on. Each knows only the path and the detections of the last metres.
     """
-    first, log = (drive(car, track, seed) for seed in (0, 1))
+    first, log = (simulated(car, track, seed) for seed in (0, 1))
     settings = settings_of(MapperSettings(), log)
     judged = judge_log(log, known_noise(log.noise), own_settings(settings))
     poses, truth = judged.chain.dead_reckoned(judged.chain.calibration_mean), truth_of(log)
     motion = motion_onto(truth.cones, truth_of(first).cones)
     true = compose(motion, interpolate_poses(truth.pose_t, truth.poses, judged.chain.stamps))
     table, driven, rows = all_detections(judged), path_lengths(poses), list[dict[str, Any]]()
-    due = np.arange(FIRST_SEARCH, driven[-1], SEARCH_INTERVAL)
-    for kind, other in ((OWN, first), (OTHER, drive(car, track + 1000, 0))):
+    due = np.arange(20.0, driven[-1], 10.0)
+    for kind, other in ((OWN, first), (OTHER, simulated(car, track + 1000, 0))):
         known = KnownMap.of(mapped(other), False, settings.of_lines)
         road = KnownRoad.of(known.splines, known.cones)
         for newest in np.unique(driven.searchsorted(due)).tolist():
@@ -189,33 +182,26 @@ def odds_of_track(car: str, track: int) -> list[dict[str, Any]]:
     return rows
 
 
-def odds_table(frame: pd.DataFrame) -> Table:
+def odds_table(frame: pd.DataFrame) -> TextTable:
     """Return how many places are wrong, and how many their odds expect, by the log odds that they claim."""
+    edges = (-100.0, 0.0, 2.0, 4.0, SURE_ODDS, 10.0, 15.0, 100.0)
     rows, expected = list[Sequence[str]](), expit(-frame["odds"])
     for name, chosen in {
         "no place": frame["odds"].isna(),
-        **{f"{low:g} to {high:g}": frame["odds"].between(low, high) for low, high in pairwise(ODDS)},
+        **{f"{low:g} to {high:g}": frame["odds"].between(low, high) for low, high in pairwise(edges)},
     }.items():
         counts = frame["kind"][chosen].value_counts().reindex([OWN, OTHER], fill_value=0)
         wrong = figures([frame["wrong"][chosen].sum(), expected[chosen].sum()], 0, 1)
         rows.append((name, *map(str, counts), *(wrong if rows else [UNKNOWN, UNKNOWN])))
-    return Table.of(("log odds", f"on {OWN}", f"on {OTHER}", "wrong", "wrong by the odds"), rows)
+    return TextTable.of(("log odds", f"on {OWN}", f"on {OTHER}", "wrong", "wrong by the odds"), rows)
 
 
 # --- several drives as one batch ---------------------------------------------------------------------------
 
-JOINT: Final = (
-    Metric("shape", "rmse of the shape", "m"),
-    Metric("ratio", "by half as many", digits=2),
-    Metric("nees", "NEES", digits=2),
-    Metric("inside", "within 2σ", "%", 1),
-    Metric("ate", "trajectory error", "m"),
-)
-
 
 def joint_of_track(car: str, track: int, drives: int) -> list[dict[str, Any]]:
     """Return a row for each map of 1, 2, 4 and so on drives of a track, each solved alone once."""
-    logs = {str(seed): drive(car, track, seed) for seed in range(drives)}
+    logs = {str(seed): simulated(car, track, seed) for seed in range(drives)}
     alone = {name: solve_alone(log) for name, log in logs.items()}
     names, rows, count = [*logs], list[dict[str, Any]](), 1
     while count <= drives:
@@ -252,52 +238,54 @@ def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) 
     }
 
 
-def joint_table(frame: pd.DataFrame) -> Table:
+def joint_table(frame: pd.DataFrame) -> TextTable:
     """Return a row for each kind of car and number of drives, with the shape by that of half as many."""
     shape = frame.groupby(["car", "track", "drives"])["shape"].mean()
     half = shape.reindex(pd.MultiIndex.from_arrays([frame["car"], frame["track"], frame["drives"] // 2]))
     count = frame["drives"].astype(str) + np.where(frame["drives"] > 1, " drives", " drive")
     named = {"cars": frame["car"], "drives of a track": count}
-    return by_name(frame.assign(ratio=frame["shape"] / half.to_numpy(), **named), [*named], JOINT)
+    metrics = (
+        Metric("shape", "rmse of the shape", "m"),
+        Metric("ratio", "by half as many", digits=2),
+        Metric("nees", "NEES", digits=2),
+        Metric("inside", "within 2σ", "%", 1),
+        Metric("ate", "trajectory error", "m"),
+    )
+    return by_name(frame.assign(ratio=frame["shape"] / half.to_numpy(), **named), [*named], metrics)
 
 
 # --- logs of a real car ----------------------------------------------------------------------------------
 
-RUNS: Final = (registry.DEFAULT_ONLINE, registry.DEFAULT_BATCH, "landmark-fixed-lag")
-SHOWN: Final = {  # metrics of each run, with short titles
-    "closed_at_end": "closed",
-    "end_off": "end off by",
-    "end_turn": "turned by",
-    "reckoned_off": "dead reckoning off by",
-    "reckoned_turn": "dead reckoning turned by",
-    "crossings": "crossings",
-    "crossings_own": "own crossings",
-    "reported_degraded": "degraded",
-    "reported_lost": "lost",
-    "ms_processor": "update",
-}
-ERRORS: Final = {  # errors of the sensor in the table, with titles and units
-    "latency": ("latency [ms]", 1e3),
-    "yaw": ("yaw [°]", 180.0 / np.pi),
-    "range_scale": ("scale [%]", 100.0),
-}
+RUNS: Final = (DEFAULT_ONLINE, DEFAULT_BATCH, "landmark-fixed-lag")
 
 
-def real_tables(folders: Sequence[Path], out: Path, **how: Any) -> dict[str, Table]:
+def real_tables(folders: Sequence[Path], out: Path, **how: Any) -> dict[str, TextTable]:
     """Map logs that `convert` has written by all estimators of `RUNS`; `how` is that of `run_records`."""
     logs = {folder.name: read_log(folder) for folder in folders}
     study = Study(name="real", logs={folder.name: (folder,) for folder in folders}, estimators=RUNS)
     runs = last_laps(run_study(study, out, keep=True, **how))
-    shown = [replace(METRICS[key], title=title) for key, title in SHOWN.items()]
+    shown = {  # metrics of each run, with short titles
+        "closed_at_end": "closed",
+        "end_off": "end off by",
+        "end_turn": "turned by",
+        "reckoned_off": "dead reckoning off by",
+        "reckoned_turn": "dead reckoning turned by",
+        "crossings": "crossings",
+        "crossings_own": "own crossings",
+        "reported_degraded": "degraded",
+        "reported_lost": "lost",
+        "ms_processor": "update",
+    }
+    metrics = [replace(METRICS[key], title=title) for key, title in shown.items()]
     return {
-        "runs": by_name(runs, ("track", "estimator"), shown),
+        "runs": by_name(runs, ("track", "estimator"), metrics),
         "maps": maps_table(runs, out / CELLS),
         "joint": real_joint_table(logs),
         "measured": measured_table(logs),
     }
 
 
-def maps_table(runs: pd.DataFrame, cells: Path) -> Table:
+def maps_table(runs: pd.DataFrame, cells: Path) -> TextTable:
     """Return the distance between the maps of each two drives around the same cones: under a metre."""
     maps = {(run.track, run.estimator): read_map(cells / run.cell) for run in runs.itertuples()}
     rows = []
@@ -305,10 +293,10 @@ def maps_table(runs: pd.DataFrame, cells: Path) -> Table:
         apart = [aligned_distance(*(maps[track, name] for track in pair)) for name in RUNS]
         if min(apart) < 1.0:
             rows.append((", ".join(pair), *figures(apart, 2)))
-    return Table.of(("maps", *(f"{name} [m]" for name in RUNS)), rows)
+    return TextTable.of(("maps", *(f"{name} [m]" for name in RUNS)), rows)
 
 
-def real_joint_table(logs: Mapping[str, Log]) -> Table:
+def real_joint_table(logs: Mapping[str, Log]) -> TextTable:
     """Return how far each drive's own batch is from that of all drives, and both from the last pose."""
     alone = {name: solve_alone(log) for name, log in logs.items()}
     joint, rows = join(alone), []
@@ -321,16 +309,21 @@ def real_joint_table(logs: Mapping[str, Log]) -> Table:
         ]
         rows.append((name, *figures([*apart.values(), *ends], 2)))
     apart_by = ("map apart, mean [m]", "rms [m]", "p95 [m]", "largest [m]")
-    return Table.of(("drive", *apart_by, "end off by, alone [m]", "together [m]"), rows)
+    return TextTable.of(("drive", *apart_by, "end off by, alone [m]", "together [m]"), rows)
 
 
-def measured_table(logs: Mapping[str, Log]) -> Table:
+def measured_table(logs: Mapping[str, Log]) -> TextTable:
     """Return what was measured on each drive, and over all of them the mean with its interval."""
+    errors_of = {  # errors of the sensor, with titles and units
+        "latency": ("latency [ms]", 1e3),
+        "yaw": ("yaw [°]", 180.0 / np.pi),
+        "range_scale": ("scale [%]", 100.0),
+    }
     header = (
         *("log", "vx [m/s]", "vy [m/s]", "wz [rad/s]", "along at 10 m [m]", "across at 10 m [m]"),
-        *("stays along [%]", "stays across [%]", *(title for title, _ in ERRORS.values())),
+        *("stays along [%]", "stays across [%]", *(title for title, _ in errors_of.values())),
     )
-    units, places = [unit for _, unit in ERRORS.values()], [SENSOR.index(name) for name in ERRORS]
+    units, places = [unit for _, unit in errors_of.values()], [SENSOR.index(name) for name in errors_of]
     rows, errors, at = [], [], np.array([10.0])
     for name, found in ((name, log.measured) for name, log in logs.items()):
         if found is None or found.along is None or found.across is None:
@@ -344,4 +337,4 @@ def measured_table(logs: Mapping[str, Log]) -> Table:
     if len(errors) > 1:
         means = (figure(*estimate(column), 1) for column in np.transpose(errors))
         rows.append(("all drives", *[UNKNOWN] * 7, *means))
-    return Table.of(header, rows)
+    return TextTable.of(header, rows)

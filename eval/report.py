@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from pathspace_graph.errors import SettingsError, check_name
+from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.io.parsing import parse_toml, read_text
 from pathspace_graph.settings.evaluation import ScalingSettings
 from pathspace_graph.settings.mapper import MapperSettings
@@ -22,22 +23,31 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
 from . import cars
-from .benchmark import QUICK, SPEED, measure_scaling, scaling_table, speed_on
+from .benchmark import QUICK, RIVAL, SPEED, measure_scaling, scaling_table, speed_on
 from .experiment.faults import at_strength, fault_table, kinds, only, outcomes
-from .experiment.provenance import made
+from .experiment.provenance import origin_of
 from .experiment.run import make_plan, rows_of, run_study
-from .experiment.study import Drive, Study, find_study, read_study_file
-from .experiment.tables import RUN_OF, Table, by_metric, by_name, contrast_table, last_laps, mean, write_csv
+from .experiment.study import Study, StudyDrive, find_study, read_study_file
+from .experiment.tables import (
+    RUN_OF,
+    TextTable,
+    by_metric,
+    by_name,
+    contrast_table,
+    last_laps,
+    mean,
+    write_csv,
+)
 from .metrics.measures import METRICS, UNKNOWN, Metric
 from .metrics.reference import landmark_rmse, solve_oracle_landmarks, truth_of
 
-ONLINE, BATCH, LANDMARKS = "fixed-lag", "spline", "landmark-fixed-lag"
-GENERATED: Final = (0, 1, 2)  # seeds of the generated tracks of the benchmark
 FILE: Final = Path(__file__).with_suffix(".toml")
 STUDIES: Final = parse_toml(read_text(FILE), FILE)
 QUICKEST: Final = ("accuracy", "skidpad", "camera", "faults", "robust", "speed", "scale")
 """Experiments of a quick report: the others have no table of their own kind."""
-Tables = dict[str, Table]  # tables of an experiment, by what follows its name; empty for the one of that name
+Tables = dict[
+    str, TextTable
+]  # tables of an experiment, by what follows its name; empty for the one of that name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +82,7 @@ class ReportPlan:
         if "beside" in about:
             other = run_study(smaller(study, about["beside"]), folder / "beside", **self.how)
             frame = pd.concat([frame, other], ignore_index=True)
-        found = dict[str, Table]()
+        found = dict[str, TextTable]()
         for part, wanted in about["tables"].items():
             options = {key: value for key, value in wanted.items() if key not in {"kind", "metrics"}}
             if "metrics" in wanted:
@@ -102,7 +112,7 @@ class ReportPlan:
 
     def speed(self, _: Path) -> Tables:
         """Time every estimator in turn on the same cycles."""
-        seeds, laps = (GENERATED[:1], 1) if self.quick else (GENERATED, 5)
+        seeds, laps = ((0,), 1) if self.quick else ((0, 1, 2), 5)
         rows = []
         for seed in seeds:
             track = generate_track(np.random.default_rng(seed))
@@ -117,7 +127,7 @@ class ReportPlan:
 
     def scale(self, folder: Path) -> Tables:
         settings = QUICK if self.quick else ScalingSettings(cones_max=800.0, laps=10)
-        points = measure_scaling((ONLINE, LANDMARKS), settings, folder=folder, on_cell=self.on_cell)
+        points = measure_scaling((DEFAULT_ONLINE, RIVAL), settings, folder=folder, on_cell=self.on_cell)
         return {"": scaling_table(points, settings)}
 
 
@@ -131,7 +141,7 @@ EXPERIMENTS: Final[Mapping[str, Callable[[ReportPlan, Path], Tables]]] = {
 }
 
 
-def landmark_limit(drive: Drive) -> list[dict[str, Any]]:
+def landmark_limit(drive: StudyDrive) -> list[dict[str, Any]]:
     """Return the rmse (m) of the landmark batch that is told all about a drive."""
     log, _ = drive.load()
     rmse = landmark_rmse(solve_oracle_landmarks(log)[1], truth_of(log))
@@ -144,13 +154,15 @@ def smaller(study: Study, parts: Mapping[str, Any]) -> Study:
     return replace(study, **{**parts, "noise": noise})
 
 
-def write_report(plan: ReportPlan, folder: Path, names: Sequence[str] = ()) -> Iterator[tuple[Path, Table]]:
+def write_report(
+    plan: ReportPlan, folder: Path, names: Sequence[str] = ()
+) -> Iterator[tuple[Path, TextTable]]:
     """Run experiments, by default all that the plan has logs for; write and yield each table."""
     for name in names:
         check_name(name, EXPERIMENTS, "--only: expected an experiment")
     every = QUICKEST if plan.quick else [name for name in EXPERIMENTS if name != "real" or plan.real]
     for name in names or every:
-        run = made(__name__)
+        run = origin_of(__name__)
         given = {"accuracy": " --tracks TRACKS" * bool(plan.tracks), "real": " --real LOGS"}.get(name, "")
         about = {
             "commit": run["commit"],
@@ -167,9 +179,11 @@ def write_report(plan: ReportPlan, folder: Path, names: Sequence[str] = ()) -> I
 # --- kinds of tables -------------------------------------------------------------------------------------
 
 
-def laps_table(study: Study, frame: pd.DataFrame, laps: Sequence[int], metrics: Sequence[Metric]) -> Table:
+def laps_table(
+    study: Study, frame: pd.DataFrame, laps: Sequence[int], metrics: Sequence[Metric]
+) -> TextTable:
     """Return metrics of the online map after some laps, and of the batch where it ran."""
-    online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
+    online, batch = (frame[frame["estimator"] == name] for name in (DEFAULT_ONLINE, DEFAULT_BATCH))
     shown = [lap for lap in laps if lap <= study.laps] or [study.laps]
     columns = {f"lap {lap}": online[online["lap"] == lap] for lap in shown}
     return by_metric(columns | ({"batch": last_laps(batch)} if len(batch) else {}), metrics)
@@ -181,16 +195,16 @@ def estimators_table(
     metrics: Sequence[Metric],
     estimators: Sequence[str] = (),
     lap: int | None = None,
-) -> Table:
+) -> TextTable:
     """Return metrics of estimators, one in each column, after a lap or at the end of the last one."""
     chosen = frame[frame["estimator"].isin(estimators or study.estimators)]
     chosen = chosen if lap is None else chosen[chosen["lap"] == lap]
     return by_metric(dict(iter(last_laps(chosen).groupby("estimator", sort=False))), metrics)
 
 
-def tracks_table(_: Study, frame: pd.DataFrame) -> Table:
+def tracks_table(_: Study, frame: pd.DataFrame) -> TextTable:
     """Return the online map and that of the batch, track by track: too few drives for an interval."""
-    online, batch = (frame[frame["estimator"] == name] for name in (ONLINE, BATCH))
+    online, batch = (frame[frame["estimator"] == name] for name in (DEFAULT_ONLINE, DEFAULT_BATCH))
     first, last = online[online["lap"] == 1], last_laps(online)
     columns = {
         "rmse, lap 1 [m]": ("rmse", first),
@@ -201,32 +215,34 @@ def tracks_table(_: Study, frame: pd.DataFrame) -> Table:
         "within 2σ [%]": ("inside", last),
         "NEES": ("nees", last),
     }
-    rows = []
-    for track in frame["track"].unique():
-        of = ((METRICS[key], key, runs[runs["track"] == track]) for key, runs in columns.values())
-        values = (m.text(m.over(runs[key].astype(float))) if key in runs else UNKNOWN for m, key, runs in of)
-        rows.append((str(track), *values))
-    return Table.of(("track", *columns), rows)
+    texts = pd.DataFrame(index=pd.Index(frame["track"].unique(), name="track"))
+    for title, (key, runs) in columns.items():
+        values = runs.groupby("track")[key].agg(METRICS[key].over) if key in runs else pd.Series(dtype=float)
+        texts[title] = [METRICS[key].text(value) for value in values.reindex(texts.index)]
+    return TextTable(texts.reset_index().astype(str))
 
 
-def rmse_table(_: Study, frame: pd.DataFrame) -> Table:
+def rmse_table(_: Study, frame: pd.DataFrame) -> TextTable:
     """Return the rmse of every online estimator after each lap."""
     laps = frame[frame["lap"] > 0]
     several = laps.groupby("estimator", sort=False)["lap"].transform("nunique") > 1
-    names = {name: runs.groupby("lap") for name, runs in laps[several].groupby("estimator", sort=False)}
-    rmse, rows = METRICS["rmse"], []
-    for lap in sorted(laps["lap"].unique()):
-        rows.append((str(lap), *(mean(rmse, of.get_group(lap)) for of in names.values())))
-    return Table.of(("rmse after lap [m]", *names), rows)
+    texts = pd.DataFrame(
+        {
+            name: {lap: mean(METRICS["rmse"], of) for lap, of in runs.groupby("lap")}
+            for name, runs in laps[several].groupby("estimator", sort=False)
+        }
+    )
+    texts = texts.sort_index().fillna(UNKNOWN).rename_axis("rmse after lap [m]")
+    return TextTable(texts.reset_index().astype(str))
 
 
-def skidpad_table(_: Study, frame: pd.DataFrame, metrics: Sequence[Metric]) -> Table:
+def skidpad_table(_: Study, frame: pd.DataFrame, metrics: Sequence[Metric]) -> TextTable:
     """Return every estimator: its trajectory error over the whole drive, and its map at the end."""
     square = (frame["ate"] ** 2).groupby([frame[name] for name in RUN_OF]).transform("mean")
     return by_name(last_laps(frame.assign(ate=square**0.5)), ("estimator",), metrics)
 
 
-KINDS: Final[Mapping[str, Callable[..., Table]]] = {
+KINDS: Final[Mapping[str, Callable[..., TextTable]]] = {
     "laps": laps_table,
     "estimators": estimators_table,
     "tracks": tracks_table,

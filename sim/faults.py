@@ -14,7 +14,7 @@ from pathspace_graph.settings.checked import AtLeast0, Checked, Share, Signed
 
 from .sensor import OdometryNoise, measure_twists
 from .track import Track, arc_lengths
-from .vehicle import Drive
+from .vehicle import Trajectory
 
 
 @dataclass(frozen=True)
@@ -102,12 +102,12 @@ class Faults:
     vehicle: VehicleFaults = VehicleFaults()
 
 
-def time_at(driven: Drive, distance: float) -> float:
+def time_at(driven: Trajectory, distance: float) -> float:
     reached = np.flatnonzero(arc_lengths(driven.poses[:, :2]) >= distance)
     return float(driven.t[reached[0]]) if len(reached) else np.inf
 
 
-def _is_during(driven: Drive, distance: float, time: float) -> NDArray[np.bool_]:
+def _is_during(driven: Trajectory, distance: float, time: float) -> NDArray[np.bool_]:
     begin = time_at(driven, distance)
     return np.asarray((driven.t >= begin) & (driven.t < begin + time))
 
@@ -120,7 +120,7 @@ def turned_round(track: Track) -> Track:
     return replace(track, left=track.right[::-1], right=track.left[::-1], start=start)
 
 
-def put_down(driven: Drive, lap: float, faults: VehicleFaults) -> Drive:
+def put_down(driven: Trajectory, lap: float, faults: VehicleFaults) -> Trajectory:
     """Remove the stretch over which the vehicle is carried; a lap is `lap` m long."""
     if not faults.put_down:
         return driven
@@ -128,11 +128,11 @@ def put_down(driven: Drive, lap: float, faults: VehicleFaults) -> Drive:
     begin = faults.put_down_at * lap
     kept = (s < begin) | (s >= begin + faults.put_down)
     count = int(kept.sum())
-    return Drive(driven.t[:count], driven.poses[kept], driven.twists[kept])
+    return Trajectory(driven.t[:count], driven.poses[kept], driven.twists[kept])
 
 
 def measure_odometry(
-    driven: Drive, lap: float, noise: OdometryNoise, faults: OdometryFaults, rng: Generator
+    driven: Trajectory, lap: float, noise: OdometryNoise, faults: OdometryFaults, rng: Generator
 ) -> tuple[Odometry, Array]:
     """Measure the twists; also return their scale error (-) and bias (rad/s) (2,)."""
     dt = float(driven.t[:2][-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
@@ -151,16 +152,10 @@ def measure_twists(twists: Array, dt: float, noise: OdometryNoise, rng: Generato
     factors = np.array([1.0 + scale, 1.0 + scale, 1.0])
     measured = np.asarray(twists * factors + np.array([0.0, 0.0, bias]) + white)
     if any(noise.slow):
-        measured += gauss_markov(twists.shape, dt / noise.slow_time, rng) * np.array(noise.slow)
+        rho, drawn = np.exp(-dt / noise.slow_time), rng.standard_normal(twists.shape)
+        drawn[1:] *= np.sqrt(1.0 - rho**2)  # a Gauss-Markov process that has its size from the beginning on
+        measured += scipy.signal.lfilter([1.0], [1.0, -rho], drawn, axis=0) * np.array(noise.slow)
     return measured, np.array([scale, bias])
-
-
-def gauss_markov(shape: tuple[int, ...], step: float, rng: Generator) -> Array:
-    """Draw Gauss-Markov processes of unit variance along axis 0; neighbours correlate by `exp(-step)`."""
-    rho = np.exp(-step)
-    drawn = rng.standard_normal(shape)
-    drawn[1:] *= np.sqrt(1.0 - rho**2)
-    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -rho], drawn, axis=0))
 
 
 def seen_from(pose: Array, points: Array) -> tuple[Array, Array]:
@@ -170,55 +165,54 @@ def seen_from(pose: Array, points: Array) -> tuple[Array, Array]:
     return np.hypot(step[:, 0], step[:, 1]), (bearings + np.pi) % (2 * np.pi) - np.pi
 
 
-def polar_detections(
-    t: float, ranges: Array, bearings: Array, labels: IntArray, settings: SensorSettings
-) -> Detections:
-    """Make a cycle of measured ranges and bearings (m,), with the covariances of the sensor's noise."""
-    points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
-    along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
-    return Detections(t, points, polar_covariances(bearings, along, across), labels)
+class Sensor(ABC):
+    """A detector whose range r reads `(1 + scale) r + bias`, with noise and with detections of nothing."""
 
+    def __init__(self, settings: SensorSettings, false_rng: Generator, drop_rng: Generator) -> None:
+        self._settings, self._false_rng, self._drop_rng = settings, false_rng, drop_rng
 
-def false_positives(settings: SensorSettings, rng: Generator) -> tuple[Array, Array, IntArray, IntArray]:
-    """Draw detections of nothing, uniform over the area of the field, with either boundary's label."""
-    count = int(rng.poisson(settings.false_positives))
-    ranges = np.sqrt(rng.uniform(settings.range_min**2, settings.range_max**2, count))
-    bearings = rng.uniform(-settings.fov / 2, settings.fov / 2, count)
-    labels = rng.integers(LEFT, RIGHT, count, endpoint=True)
-    return ranges, bearings, labels, np.full(count, FALSE_POSITIVE)
-
-
-class ConeSensor:
-    def __init__(self, cones: Array, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
-        blind_rng, self._cone_rng, self._false_rng, self._slow_rng, self._second_rng, self._drop_rng = (
-            rng.spawn(6)
-        )
-        self._cones, self._labels, self._settings = cones, labels, settings
-        count = round(settings.blind_fraction * len(cones))
-        self.blind: IntArray = np.sort(blind_rng.permutation(len(cones))[:count])
-        self._seen = np.setdiff1d(np.arange(len(cones)), self.blind)
-        self._slow = self._slow_rng.standard_normal((CAMERAS, 2, len(cones)))
+    @abstractmethod
+    def _see(self, pose: Array, scale: float, bias: float) -> tuple[Array, Array, IntArray, IntArray, Array]:
+        """Measured ranges, bearings, labels, true points (m,), and scatter beside the noise (m, 2) in m."""
 
     def detect(
         self, t: float, pose: Array, scale: float = 0.0, bias: float = 0.0
     ) -> tuple[Detections, IntArray]:
         """Detect a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
 
-        The second result is the true cone of each detection (m,).
+        The second result is the true cone of each detection (m,), or the nearest true point of a line. Each
+        covariance is that of the noise of range and bearing, and of the scatter. Detections of nothing are
+        uniform over the area of the field, with either boundary's label.
         """
-        parts = zip(
-            self._detect_cones(pose, scale, bias),
-            false_positives(self._settings, self._false_rng),
-            strict=True,
+        settings, rng = self._settings, self._false_rng
+        count = int(rng.poisson(settings.false_positives))
+        false = (
+            np.sqrt(rng.uniform(settings.range_min**2, settings.range_max**2, count)),
+            rng.uniform(-settings.fov / 2, settings.fov / 2, count),
+            rng.integers(LEFT, RIGHT, count, endpoint=True),
+            np.full(count, FALSE_POSITIVE),
+            np.zeros((count, 2)),
         )
-        ranges, bearings, labels, cones = (np.concatenate(part) for part in parts)
-        detections = polar_detections(t, ranges, bearings, labels, self._settings)
-        kept = np.full(len(cones), self._drop_rng.random() >= self._settings.dropped_cycles)
-        return detections.where(kept), cones[kept]
+        parts = zip(self._see(pose, scale, bias), false, strict=True)
+        ranges, bearings, labels, index, scatter = (np.concatenate(part) for part in parts)
+        along, across = settings.range_sigmas(ranges) ** 2, (ranges * settings.bearing_sigma) ** 2
+        covariances = polar_covariances(bearings, along, across) + scatter[:, :, None] * scatter[:, None, :]
+        points = np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
+        kept = np.full(len(index), self._drop_rng.random() >= settings.dropped_cycles)
+        return Detections(t, points, covariances, labels).where(kept), index[kept]
 
-    def _detect_cones(
-        self, pose: Array, scale: float, bias: float
-    ) -> tuple[Array, Array, IntArray, IntArray]:
+
+class ConeSensor(Sensor):
+    def __init__(self, cones: Array, labels: IntArray, settings: SensorSettings, rng: Generator) -> None:
+        blind_rng, self._cone_rng, false_rng, self._slow_rng, self._second_rng, drop_rng = rng.spawn(6)
+        super().__init__(settings, false_rng, drop_rng)
+        self._cones, self._labels = cones, labels
+        count = round(settings.blind_fraction * len(cones))
+        self.blind: IntArray = np.sort(blind_rng.permutation(len(cones))[:count])
+        self._seen = np.setdiff1d(np.arange(len(cones)), self.blind)
+        self._slow = self._slow_rng.standard_normal((CAMERAS, 2, len(cones)))
+
+    def _see(self, pose: Array, scale: float, bias: float) -> tuple[Array, Array, IntArray, IntArray, Array]:
         settings, rng = self._settings, self._cone_rng
         ranges, bearings = seen_from(pose, self._cones[self._seen])
         inside = settings.is_inside(ranges, bearings)
@@ -238,7 +232,7 @@ class ConeSensor:
         ranges = ranges + settings.range_sigmas(ranges) * errors[:, 0]
         bearings = bearings + settings.bearing_sigma * errors[:, 1]
         index = np.nonzero(rows)[1]
-        return ranges[rows], bearings[rows], labels[index], cones[index]
+        return ranges[rows], bearings[rows], labels[index], cones[index], np.zeros((len(index), 2))
 
     def _errors(self, white: Array, cones: IntArray) -> Array:
         """Errors (2, 2, m) of unit variance by camera, range or bearing, and cone.
@@ -309,7 +303,7 @@ def as_lines(track: Track) -> Track:
     return replace(track, left=rows[0], right=rows[1], other=np.zeros((0, 2)), other_labels=None)
 
 
-class LineSensor:
+class LineSensor(Sensor):
     """Points anywhere along both boundaries, drawn independently in each cycle.
 
     A covariance is that of the noise of range and bearing, and of the scatter across the boundary: the
@@ -321,38 +315,16 @@ class LineSensor:
         self, track: Track, labels: IntArray, settings: SensorSettings, line: LineSettings, rng: Generator
     ) -> None:
         """Take a track of `as_lines` in the map frame, and the label of each of its points."""
-        gap_rng, self._place_rng, self._noise_rng, self._false_rng, self._drop_rng = rng.spawn(5)
-        self._settings, self._line, self._labels = settings, line, labels
+        gap_rng, self._place_rng, self._noise_rng, false_rng, drop_rng = rng.spawn(5)
+        super().__init__(settings, false_rng, drop_rng)
+        self._line, self._labels = line, labels
         self._curves = [curve_through(row, track.closed) for row in (track.left, track.right)]
         self._counts = (len(track.left), len(track.right))
         sides = gap_rng.integers(0, len(self._curves), line.gaps)
         self.gaps = [(int(side), float(gap_rng.uniform(0.0, self._curves[side].length))) for side in sides]
         """Boundary of each gap, and the place along it where the gap begins (m)."""
 
-    def detect(
-        self, t: float, pose: Array, scale: float = 0.0, bias: float = 0.0
-    ) -> tuple[Detections, IntArray]:
-        """Detect a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
-
-        The second result is the point of the true boundary nearest to each detection (m,).
-        """
-        settings = self._settings
-        ranges, bearings, labels, nearest, normals = self._detect_lines(pose, scale, bias)
-        found = polar_detections(t, ranges, bearings, labels, settings)
-        ahead = direction(pose[2])
-        vehicle = np.column_stack([ahead, left_of(ahead)])  # turns rows of the map frame into it
-        scatter = self._line.sigma_across * normals @ vehicle
-        found = replace(found, covariances=found.covariances + scatter[:, :, None] * scatter[:, None, :])
-        ranges, bearings, labels, none = false_positives(settings, self._false_rng)
-        found = found.with_others(polar_detections(t, ranges, bearings, labels, settings))
-        index = np.concatenate([nearest, none])
-        kept = np.full(len(index), self._drop_rng.random() >= settings.dropped_cycles)
-        return found.where(kept), index[kept]
-
-    def _detect_lines(
-        self, pose: Array, scale: float, bias: float
-    ) -> tuple[Array, Array, IntArray, IntArray, Array]:
-        """Measured ranges and bearings, labels, nearest true points and normals (m, 2)."""
+    def _see(self, pose: Array, scale: float, bias: float) -> tuple[Array, Array, IntArray, IntArray, Array]:
         settings, rng = self._settings, self._noise_rng
         points, normals, nearest = self._draw()
         chance, colour = rng.random((2, len(points)))
@@ -365,7 +337,10 @@ class LineSensor:
         bearings = bearings + settings.bearing_sigma * bearing
         labels = self._labels[nearest]
         labels = np.where(colour < settings.wrong_colour, LEFT + RIGHT - labels, labels)
-        return ranges[seen], bearings[seen], labels[seen], nearest[seen], normals[seen]
+        ahead = direction(pose[2])
+        vehicle = np.column_stack([ahead, left_of(ahead)])  # turns rows of the map frame into it
+        scatter = self._line.sigma_across * normals[seen] @ vehicle
+        return ranges[seen], bearings[seen], labels[seen], nearest[seen], scatter
 
     def _draw(self) -> tuple[Array, Array, IntArray]:
         """Draw points (m, 2) of both boundaries, with their normals and the nearest true points (m,)."""

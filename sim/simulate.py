@@ -46,7 +46,7 @@ from .sensor import (
     as_lines,
 )
 from .track import Track, to_map_frame
-from .vehicle import Drive, VehicleSettings, displacements, drive
+from .vehicle import Trajectory, VehicleSettings, displacements, drive
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
 def _perceive(
     track: Track,
     lap: float,
-    driven: Drive,
+    driven: Trajectory,
     settings: SimulationSettings,
     sensor_rng: Generator,
     colour_rng: Generator,
@@ -207,7 +207,7 @@ def _perceive(
     return cycles, np.concatenate(associations)
 
 
-def _poses_at(driven: Drive, stamps: Array) -> Array:
+def _poses_at(driven: Trajectory, stamps: Array) -> Array:
     """True poses (n, 3) at any stamps within the drive; the twist before each is held until then."""
     index = np.searchsorted(driven.t, stamps, side="right") - 1
     poses = driven.poses[index]

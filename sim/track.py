@@ -34,10 +34,15 @@ class Track(Brief):
 
     @cached_property
     def centre_line(self) -> SmoothCurve:
-        """The smooth curve halfway between the boundaries, or along the path, track frame."""
-        if self.path is not None:
-            return along_path(self.path, np.vstack([self.left, self.right]), self.closed)
-        return fit_centre_line(self.left, self.right, self.closed, self.start[:2])
+        """The smooth curve halfway between the boundaries, or along the path, track frame.
+
+        Its clearance is the distance to the nearer row, or to the nearest cone.
+        """
+        if self.path is None:
+            return fit_centre_line(self.left, self.right, self.closed, self.start[:2])
+        curve = _smooth(resample(self.path, STEP, self.closed)[0], self.closed)
+        cones = scipy.spatial.KDTree(np.vstack([self.left, self.right]))
+        return _as_spline(curve, np.asarray(cones.query(curve)[0]), self.closed)
 
     @property
     def rows(self) -> tuple[Array, Array]:
@@ -143,10 +148,6 @@ class SmoothCurve:
     def curvatures(self, s: Array) -> Array:
         return curvature(np.asarray(self.spline(s, 1)), np.asarray(self.spline(s, 2)))
 
-    def clearances(self, s: Array) -> Array:
-        period = self.length if self.closed else None
-        return np.interp(s, self.spline.x, self.clearance, period=period)
-
     def nearest(self, pose: Array) -> float:
         """Arc length of the point nearest to a pose (3,) whose tangent leads forward."""
         s = np.arange(0.0, self.length, STEP)
@@ -171,14 +172,10 @@ def fit_centre_line(left: Array, right: Array, closed: bool, near: Array) -> Smo
 
     for _ in range(4):  # moved to equal distances from both rows, and smoothed
         to_left, to_right = distances(curve)
-        curve = _smooth(curve + _normals(curve, closed) * (to_left - to_right)[:, None] / 2, closed)
+        along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
+        normals = left_of(unit(along if closed else np.gradient(curve, axis=0)))
+        curve = _smooth(curve + normals * (to_left - to_right)[:, None] / 2, closed)
     return _as_spline(curve, np.minimum(*distances(curve)), closed)
-
-
-def along_path(points: Array, cones: Array, closed: bool) -> SmoothCurve:
-    """Fit a smooth curve along points (k, 2), whose clearance is the distance to the nearest cone."""
-    curve = _smooth(resample(points, STEP, closed)[0], closed)
-    return _as_spline(curve, np.asarray(scipy.spatial.KDTree(cones).query(curve)[0]), closed)
 
 
 def match_rows(left: Array, right: Array, closed: bool, near: Array) -> IntArray:
@@ -231,11 +228,6 @@ def _smooth(curve: Array, closed: bool) -> Array:
     pad = min(int(4 * sigma), len(curve) - 1)
     padded = np.pad(curve, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
     return np.asarray(scipy.ndimage.gaussian_filter1d(padded, sigma, axis=0)[pad:-pad])
-
-
-def _normals(curve: Array, closed: bool) -> Array:
-    along = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
-    return left_of(unit(along if closed else np.gradient(curve, axis=0)))
 
 
 def _row_distances(curve: Array, row: Array, index: IntArray, closed: bool) -> Array:

@@ -3,6 +3,7 @@
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -33,7 +34,6 @@ WIDTH_STEP: Final = 0.5  # distance of samples of a circuit (m)
 TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # centre line and widths
 EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
 """EUFS tags of cones of no boundary; further tags, such as midpoint, are no cones."""
-EUFS_TAGS: Final = ("blue", "yellow", *EUFS_OTHER, "car_start", "midpoint")
 EUFS_COLUMNS: Final = ("tag", "x", "y", "direction", "x_variance", "y_variance", "xy_covariance")
 """Columns of an EUFS file in their order, which FSDS writes without a header."""
 KNOWN: Final = (
@@ -58,7 +58,11 @@ def read_track(path: Path | str) -> Track:
         text = read_text(path, most=MAX_TRACK_BYTES)
         first = next(filter(str.strip, text.split("\n")), "").strip()
         tag, *numbers = (part.strip(' "') for part in first.split(","))
-        is_cone = tag.lower() in EUFS_TAGS and len(numbers) >= 2 and all(map(is_number, numbers[:2]))
+        is_cone = (
+            tag.lower() in {"blue", "yellow", *EUFS_OTHER, "car_start", "midpoint"}
+            and len(numbers) >= 2
+            and all(map(is_number, numbers[:2]))
+        )
         header = EUFS_COLUMNS[: 1 + len(numbers)] if is_cone else ()  # where the file has none
         table = read_table(path, comment="#", header=header)
         if not {"x_m", "y_m"}.isdisjoint(table.columns):
@@ -229,22 +233,6 @@ def _without_duplicates(cones: Array) -> Array:
 
 
 def _tum(table: Table) -> Track:
-    circuit = _tum_circuit(table)
-    knots = arc_lengths(circuit[:, :2])
-    spline = scipy.interpolate.CubicSpline(knots, circuit[:, :2], bc_type="periodic")
-    s = np.linspace(0.0, knots[-1], math.ceil(knots[-1] / WIDTH_STEP), endpoint=False)
-    points, tangents = np.asarray(spline(s)), unit(np.asarray(spline(s, 1)))
-    edges = (
-        points + side * left_of(tangents) * np.interp(s, knots, circuit[:, k])[:, None]
-        for side, k in ((-1.0, 2), (1.0, 3))
-    )
-    right, left = (resample(edge, 5.0, closed=True)[0] for edge in edges)
-    start = np.append(circuit[0, :2], math.atan2(tangents[0, 1], tangents[0, 0]))
-    return Track(left, right, np.zeros((0, 2)), True, start, table.file.stem)
-
-
-def _tum_circuit(table: Table) -> Array:
-    """Checked rows [x, y, right width, left width], with the first repeated at the end (n + 1, 4)."""
     circuit = table.stack(TUM_COLUMNS)
     widths = circuit[:, 2:]
     table.require(np.asarray(widths.min(axis=1) > 0), "expected widths above 0")
@@ -256,7 +244,18 @@ def _tum_circuit(table: Table) -> Array:
     circuit = circuit[: len(_without_repeats(circuit[:, :2], closed=True))]
     if len(circuit) < MIN_CONES:
         raise InputError(table.file, f"expected at least {MIN_CONES} points, found {len(circuit)}")
-    return ring(circuit)
+    circuit = ring(circuit)
+    knots = arc_lengths(circuit[:, :2])
+    spline = scipy.interpolate.CubicSpline(knots, circuit[:, :2], bc_type="periodic")
+    s = np.linspace(0.0, knots[-1], math.ceil(knots[-1] / WIDTH_STEP), endpoint=False)
+    points, tangents = np.asarray(spline(s)), unit(np.asarray(spline(s, 1)))
+    edges = (
+        points + side * left_of(tangents) * np.interp(s, knots, circuit[:, k])[:, None]
+        for side, k in ((-1.0, 2), (1.0, 3))
+    )
+    right, left = (resample(edge, 5.0, closed=True)[0] for edge in edges)
+    start = np.append(circuit[0, :2], math.atan2(tangents[0, 1], tangents[0, 0]))
+    return Track(left, right, np.zeros((0, 2)), True, start, table.file.stem)
 
 
 # --- driving order of cones: a walk along the lane, triangle by triangle ----------------------------------
@@ -296,7 +295,12 @@ def _order(left: Array, right: Array, gate: Array, start: Array) -> DrivingOrder
     gate_left, gate_right = gate[near & (side > 0)], gate[near & (side <= 0)]
     points = np.vstack([left, gate_left, right, gate_right])
     split, right_end = len(left) + len(gate_left), len(left) + len(gate_left) + len(right)
-    apexes = _apexes(points)
+    apexes: dict[Rung, list[int]] = defaultdict(list)
+    with suppress(scipy.spatial.QhullError):
+        for i, j, k in map(sorted, scipy.spatial.Delaunay(points).simplices.tolist()):
+            apexes[i, j].append(k)
+            apexes[i, k].append(j)
+            apexes[j, k].append(i)
     first = _first_rung(points, split, apexes, start)
     if first is None:
         return None
@@ -306,19 +310,6 @@ def _order(left: Array, right: Array, gate: Array, start: Array) -> DrivingOrder
     lefts = _row(left, [i for i, _ in rungs if i < len(left)], closed)
     rights = _row(right, [j - split for _, j in rungs if j < right_end], closed)
     return DrivingOrder(lefts, rights, closed)
-
-
-def _apexes(points: Array) -> Apexes:
-    apexes: dict[Rung, list[int]] = defaultdict(list)
-    try:
-        triangles = scipy.spatial.Delaunay(points).simplices.tolist()
-    except scipy.spatial.QhullError:
-        return apexes
-    for i, j, k in map(sorted, triangles):
-        apexes[i, j].append(k)
-        apexes[i, k].append(j)
-        apexes[j, k].append(i)
-    return apexes
 
 
 def _first_rung(points: Array, split: int, apexes: Apexes, start: Array) -> Rung | None:
@@ -339,22 +330,16 @@ def _first_rung(points: Array, split: int, apexes: Apexes, start: Array) -> Rung
 def _walk(points: Array, split: int, apexes: Apexes, first: Rung, forward: bool) -> tuple[list[Rung], bool]:
     rungs = {first: None}  # in order, without repeats
     i, j = first
-    while (apex := _next_apex(points, apexes[i, j], (i, j), forward)) is not None:
+    while True:
+        across, steps = points[i] - points[j], points[apexes[i, j]] - points[j]
+        is_ahead = (across[0] * steps[:, 1] - across[1] * steps[:, 0] < 0) == forward
+        if not is_ahead.any():
+            return list(rungs), False
+        apex = apexes[i, j][int(is_ahead.argmax())]
         i, j = rung = (apex, j) if apex < split else (i, apex)
         if rung in rungs or np.linalg.norm(points[i] - points[j]) > RUNG_MAX:
             return list(rungs), rung == first
         rungs[rung] = None
-    return list(rungs), False
-
-
-def _next_apex(points: Array, apexes: Sequence[int], rung: Rung, forward: bool) -> int | None:
-    left, right = points[rung[0]], points[rung[1]]
-    a = left - right
-    for apex in apexes:
-        b = points[apex] - right
-        if (a[0] * b[1] - a[1] * b[0] < 0) == forward:
-            return apex
-    return None
 
 
 def _row(cones: Array, walked: list[int], closed: bool) -> IntArray:

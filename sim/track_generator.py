@@ -82,10 +82,6 @@ class _Layout(NamedTuple):
     radii: Array
 
 
-def _least_radius(width: float) -> float:
-    return (HAIRPIN_DIAMETER - width) / 2
-
-
 def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _Layout | None:
     """Draw a star-shaped polygon with hairpins on some sides, or None where a corner cannot be rounded."""
     count = int(rng.integers(*settings.corners, endpoint=True))
@@ -98,7 +94,7 @@ def _layout(width: float, settings: TrackGeneratorSettings, rng: Generator) -> _
     perimeter = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum()
     # rounding the corners shortens the lap by about a tenth
     corners *= (rng.uniform(*settings.lap_length) * 1.1 - 2 * legs.sum()) / perimeter
-    least = _least_radius(width)
+    least = (HAIRPIN_DIAMETER - width) / 2
     radii = least + rng.gamma(2.0, 4.0, count)
     layout: _Layout | None = _Layout(corners, radii)
     for leg in legs:
@@ -221,7 +217,7 @@ def _keeps_rules(curve: Array, width: float, settings: TrackGeneratorSettings) -
     apart = np.minimum(apart, len(curve) - apart) * STEP  # samples that are near are of one stretch
     return bool(
         settings.lap_length[0] <= arc_lengths(ring(curve))[-1] <= settings.lap_length[1]
-        and bend.max() * _least_radius(width) <= 1
+        and bend.max() * (HAIRPIN_DIAMETER - width) / 2 <= 1
         and _longest_run(bend < 1 / STRAIGHT_RADIUS)[1] * STEP <= 80.0  # m
         and (apart < np.pi * distance / 2).all()
     )

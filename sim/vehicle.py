@@ -63,13 +63,15 @@ class VehicleSettings(Checked):
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class Trajectory:
+    """The true motion of a drive."""
+
     t: Array  # stamps (N,) in s, from 0
     poses: Array  # true poses [x, y, theta] (N, 3), map frame, from (0, 0, 0); theta is not wrapped
     twists: Array  # true body twists [vx, vy, wz] (N, 3), each held until the next stamp
 
 
-def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> Drive:
+def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) -> Trajectory:
     """Drive `laps` laps of a track in the map frame and a little more, or once along an open one."""
     path = _driven_path(track, laps, settings, rng)
     s = _stations(path, _speed_profile(path, settings), settings.rate)
@@ -79,7 +81,7 @@ def drive(track: Track, laps: int, settings: VehicleSettings, rng: Generator) ->
     rest, stand = (np.zeros((round(time * settings.rate), 3)) for time in (settings.rest, settings.stand))
     twists = np.concatenate([rest, twists, stand])
     t = np.arange(len(twists)) / settings.rate
-    return Drive(t, integrate(twists[:-1], 1.0 / settings.rate), twists)
+    return Trajectory(t, integrate(twists[:-1], 1.0 / settings.rate), twists)
 
 
 def integrate(twists: Array, dt: float | Array) -> Array:
@@ -125,7 +127,9 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
     s = np.linspace(0.0, total, max(int(total / 0.25), 10))
     at = (start + s) % line.length if line.closed else start + s
     normals = line.normals(at)
-    offset = _wander(s, line.clearances(at), settings, rng) + _settling(line, start, track.start, s, settings)
+    period = line.length if line.closed else None
+    clearance = np.interp(at, line.spline.x, line.clearance, period=period)
+    offset = _wander(s, clearance, settings, rng) + _settling(line, start, track.start, s, settings)
     points = line.points(at) + normals * offset[:, None]
     points += (track.start[:2] - points[0]) * np.exp(-s / settings.settle_distance)[:, None]
     return scipy.interpolate.CubicSpline(

@@ -168,12 +168,8 @@ def imported_by(node: ast.AST) -> list[str]:
 
 # --- names -----------------------------------------------------------------------------------------------
 
-TWICE = {
-    *("Drive", "Table"),
-    *("drive", "driving_order", "made", "main"),
-}
-"""Public functions and classes that still stand in two modules: `main` is an entry point's, the others are
-to be renamed. No name joins them, and a name that stands once is taken off."""
+TWICE = {"main"}
+"""Public functions and classes that stand in two modules: each is an entry point's. No name joins them."""
 
 
 def test_a_public_name_stands_once() -> None:

@@ -27,7 +27,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .run import EstimatorCell, Plan, Record, add_batch, make_plan, run_folder, run_records
 from .study import Study, log_folders
-from .tables import Table, estimate, write_csv
+from .tables import TextTable, estimate, write_csv
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
 WITHOUT_TRUTH: Final = (  # metrics that say something of a log without true cones
@@ -60,8 +60,8 @@ class Comparison:
     """All results, log by log."""
 
     study: Study
-    results: Sequence[tuple[dict[str, Any], EstimatorCell, Record]]
-    """Log and estimator of each run, its cell and its record."""
+    results: Sequence[tuple[EstimatorCell, Record]]
+    """Cell and record of each run."""
     frame: pd.DataFrame
     """Tidy row per run and lap, and one per run for the whole log."""
     has_truth: bool
@@ -69,26 +69,27 @@ class Comparison:
 
     @property
     def failures(self) -> list[dict[str, Any]]:
-        return [{**names, "error": one["failure"]} for names, _, one in self.results if one["failure"]]
+        return [{**_names(cell), "error": one["failure"]} for cell, one in self.results if one["failure"]]
 
     @property
     def unsettled(self) -> list[dict[str, Any]]:
         """Names of the batches that did not converge."""
-        runs = ((names, one["rows"]) for names, _, one in self.results)
-        return [names for names, rows in runs if rows and rows[-1].get("converged") is False]
+        runs = ((cell, one["rows"]) for cell, one in self.results)
+        return [_names(cell) for cell, rows in runs if rows and rows[-1].get("converged") is False]
+
+
+def _names(cell: EstimatorCell) -> dict[str, Any]:
+    return {"log": cell.drive.track, "estimator": cell.estimator}
 
 
 def compare(plan: Plan, folder: Path, **how: Any) -> Comparison:
     """Run what is missing of a plan in a folder; `how` is that of `run_records`."""
     records, rows = run_records(plan, folder, **how), list[dict[str, Any]]()
-    results = [
-        ({"log": cell.drive.track, "estimator": cell.estimator}, cell, records[cell.id])
-        for cell in plan.cells
-    ]
-    for names, _, record in results:
+    results = [(cell, records[cell.id]) for cell in plan.cells]
+    for cell, record in results:
         for row in record["rows"]:
             about = {"scope": "lap" if row["lap"] else "log", "lap": row["lap"] or record["lap_count"]}
-            rows.append({**row, **names, **about})
+            rows.append({**row, **_names(cell), **about})
     add_batch(rows, ("log",))
     known = [key for key in METRICS if any(key in row for row in rows)]
     frame = pd.DataFrame(rows, columns=["log", "estimator", "scope", "lap", *known])
@@ -99,7 +100,7 @@ def compare(plan: Plan, folder: Path, **how: Any) -> Comparison:
 # --- tables ----------------------------------------------------------------------------------------------
 
 
-def tables(comparison: Comparison) -> dict[str, Table]:
+def tables(comparison: Comparison) -> dict[str, TextTable]:
     """Return the tables by the name of their files."""
     short = paper_table(comparison) if comparison.has_truth else final_table(comparison, WITHOUT_TRUTH)
     return {"table": short, "metrics": final_table(comparison)}
@@ -118,13 +119,13 @@ def paper_frame(comparison: Comparison) -> pd.DataFrame:
         laps = runs[runs["scope"] == "lap"]
         for lap, over_logs in laps.groupby("lap") if len(laps) else [(np.nan, runs)]:
             found = {metric.key: estimate(over_logs.get(metric.key, ())) for metric in PAPER}
-            means = {key: of.mean for key, of in found.items()}
-            halves = {f"{key}_half": of.half for key, of in found.items()}
+            means = {key: mean for key, (mean, _) in found.items()}
+            halves = {f"{key}_half": half for key, (_, half) in found.items()}
             rows.append({"estimator": estimator, "lap": lap, "logs": len(over_logs), **means, **halves})
     return pd.DataFrame(rows).astype({"lap": "Int64"})
 
 
-def paper_table(comparison: Comparison) -> Table:
+def paper_table(comparison: Comparison) -> TextTable:
     """Return the paper's Table 1, lap by lap."""
     found = paper_frame(comparison)
     ends = np.where(found["logs"] > 0, "end", "failed")
@@ -134,20 +135,20 @@ def paper_table(comparison: Comparison) -> Table:
     for metric in PAPER:
         both = zip(found[metric.key], found[f"{metric.key}_half"], strict=True)
         texts[metric.heading] = [metric.text(*pair) for pair in both]
-    return Table(texts, _title(comparison, "at the end of each lap"))
+    return TextTable(texts, _title(comparison, "at the end of each lap"))
 
 
-def final_table(comparison: Comparison, keys: Sequence[str] = tuple(METRICS)) -> Table:
+def final_table(comparison: Comparison, keys: Sequence[str] = tuple(METRICS)) -> TextTable:
     """Return the means over the logs of metrics of whole logs, with a column for each estimator."""
     frame, names = comparison.frame, comparison.study.estimators
     final = frame[frame["scope"] == "log"]
     known = [METRICS[key] for key in keys if key in final and final[key].astype(float).notna().any()]
     of = {name: final[final["estimator"] == name] for name in names}
     rows = ((m.heading, *(m.text(m.over(of[name][m.key])) for name in names)) for m in known)
-    return Table.of(("metric", *names), rows, _title(comparison, "at the end of the log"))
+    return TextTable.of(("metric", *names), rows, _title(comparison, "at the end of the log"))
 
 
-def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> Table:
+def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> TextTable:
     """Return Table 1 as in the paper: a row per lap, with rmse, missed and size under each estimator."""
     titles = "   ".join(metric.heading for metric in PAPER)
     header, rows = ("lap", *(f"{name}\n{titles}" for name in laps)), []
@@ -155,7 +156,7 @@ def side_by_side(laps: dict[str, Sequence[LapMetrics]]) -> Table:
         values = ({} if row is None else asdict(row) for row in beside)
         texts = ([(m.text(row.get(m.key, np.nan)), len(m.heading)) for m in PAPER] for row in values)
         rows.append((str(lap), *("   ".join(text.rjust(width) for text, width in three) for three in texts)))
-    return Table.of(header, rows, names=0)
+    return TextTable.of(header, rows, names=0)
 
 
 def _title(comparison: Comparison, when: str) -> str:
@@ -174,7 +175,7 @@ def write_comparison(out: Path, comparison: Comparison, jobs: int, *, force: boo
     Each of several logs has a folder of its own. An earlier comparison in `out` is replaced if `force`.
     """
     study = comparison.study
-    stages = [{**names, **stage} for names, _, one in comparison.results for stage in one.get("stages", ())]
+    stages = [{**_names(of), **stage} for of, one in comparison.results for stage in one.get("stages", ())]
     times = pd.DataFrame(stages, columns=["log", "estimator", "stage", "mean", "median", "p99", "share"])
     frames = {"table": paper_frame(comparison), "metrics": comparison.frame, "times": times}
     with atomic_folder(out, MARKER, force=force) as folder:
@@ -182,8 +183,22 @@ def write_comparison(out: Path, comparison: Comparison, jobs: int, *, force: boo
             table.write(folder, name, "md", "tex")
         for name, frame in frames.items():
             write_csv(folder / f"{name}.csv", frame)
-        for log in study.logs:
-            _write_log(folder if len(study.logs) == 1 else folder / log, log, comparison)
+        for log in study.logs:  # with the files of its runs, and their maps in one picture
+            place = folder if len(study.logs) == 1 else folder / log
+            drawn, truth = dict[str, tuple[Map, Array]](), None
+            place.mkdir(exist_ok=True)
+            for cell, record in comparison.results:
+                if cell.drive.track != log or record["failure"]:
+                    continue
+                run = shutil.copytree(run_folder(comparison.folder, cell), place / cell.estimator)
+                file = next(run / name for name in (SMOOTHED_FILE, TRAJECTORY_FILE) if (run / name).exists())
+                whole = record["rows"][-1]
+                known = [metric for metric in PAPER if whole.get(metric.key) is not None]
+                texts = [f"{m.title} {m.text(whole[m.key])} {m.unit}".strip() for m in known]
+                drawn[f"{cell.estimator}\n{', '.join(texts)}"] = read_map(run), read_trajectory(file)[1]
+                truth = cell.drive.load()[0].truth
+            if drawn:
+                save_figures(place, {"maps": plot_maps(drawn, truth)})
         about = {
             "format": "pathspace-comparison/1",
             "logs": [*study.logs],
@@ -194,20 +209,3 @@ def write_comparison(out: Path, comparison: Comparison, jobs: int, *, force: boo
             "versions": versions(),
         }
         write_json(folder / MARKER, about)
-
-
-def _write_log(folder: Path, name: str, comparison: Comparison) -> None:
-    """Copy the files of the runs on a log, and draw their maps."""
-    folder.mkdir(exist_ok=True)
-    drawn, truth = dict[str, tuple[Map, Array]](), None
-    for names, cell, record in comparison.results:
-        if names["log"] != name or record["failure"]:
-            continue
-        run = shutil.copytree(run_folder(comparison.folder, cell), folder / cell.estimator)
-        file = next(run / name for name in (SMOOTHED_FILE, TRAJECTORY_FILE) if (run / name).exists())
-        known = [metric for metric in PAPER if record["rows"][-1].get(metric.key) is not None]
-        texts = [f"{m.title} {m.text(record['rows'][-1][m.key])} {m.unit}".strip() for m in known]
-        drawn[f"{cell.estimator}\n{', '.join(texts)}"] = read_map(run), read_trajectory(file)[1]
-        truth = cell.drive.load()[0].truth
-    if drawn:
-        save_figures(folder, {"maps": plot_maps(drawn, truth)})

@@ -17,7 +17,7 @@ from pathspace_graph.io.files import write_json
 from pathspace_graph.plausibility.diagnosis import PRIOR_LIMIT
 
 from .study import Study, find_study, read_study_file
-from .tables import RUN, Table, last_laps, write_csv, write_results
+from .tables import RUN, TextTable, last_laps, write_csv, write_results
 
 CLEAN: Final = "clean"  # name of the noise without a fault, which every other one is compared with
 FIGURES: Final = {  # of an outcome: metric, ratio or sign of the runs, how it is taken over them, its column
@@ -117,7 +117,7 @@ def beside_clean(frame: pd.DataFrame) -> pd.DataFrame:
     return last.assign(reported=(last["notices"] != "") | (last["reported_lost"] > 0.0))
 
 
-def fault_table(study: Study, found: Sequence[dict[str, Any]], *, notices: bool = False) -> Table:
+def fault_table(study: Study, found: Sequence[dict[str, Any]], *, notices: bool = False) -> TextTable:
     """Return the cost of each fault relative to the clean run of its track, and how often it is reported.
 
     With `notices` it has what was said as well: calibrations far from their prior (sigmas), and notices.
@@ -143,7 +143,7 @@ def fault_table(study: Study, found: Sequence[dict[str, Any]], *, notices: bool 
         "of the clean run on the same track and with the same seed. Lost means more than 5 m off in the last "
         "second."
     )
-    return Table(pd.DataFrame(rows), title)
+    return TextTable(pd.DataFrame(rows), title)
 
 
 def write_suite(study: Study, frame: pd.DataFrame, out: Path) -> str:

@@ -132,7 +132,7 @@ def here() -> str:
 # --- where and when ----------------------------------------------------------------------------------------
 
 
-def made(module: str) -> dict[str, Any]:
+def origin_of(module: str) -> dict[str, Any]:
     """Return where and when a result of what is in a module is made, and with which libraries."""
     packages = {HOUSE, module.partition(".")[0]}
     specs = {name: _spec(name) for name in sorted(packages)}

@@ -6,12 +6,11 @@ import sys
 import tempfile
 import time
 import traceback
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any, Final
@@ -42,8 +41,8 @@ from pathspace_graph.run import run_online, with_own
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import Track
 
-from .provenance import Code, check_code, code_from, code_of, here, identity, made
-from .study import Drive, Study, load_tracks, recorded_drive, simulated_drive, track_digest
+from .provenance import Code, check_code, code_from, code_of, here, identity, origin_of
+from .study import Study, StudyDrive, load_tracks, recorded_drive, simulated_drive, track_digest
 from .tables import RUN, RUN_OF
 
 try:
@@ -70,7 +69,7 @@ class WorkerDiedError(RuntimeError):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Cell(ABC):
+class Cell:
     """One part of a study, which is run once, in whatever process."""
 
     module: str
@@ -83,12 +82,10 @@ class Cell(ABC):
     """Code with which the study began."""
     began: str
     """Process in which it did."""
+    work: Callable[[], Record]
+    """Does what the cell does; the record has the `rows` that are returned, and other keys."""
     keep: bool = False
     """Whether the files of its run are kept beside its record."""
-
-    @abstractmethod
-    def work(self) -> Record:
-        """Do what it does; the record has the `rows` that are returned, and other keys."""
 
     @cached_property
     def id(self) -> str:
@@ -111,7 +108,7 @@ class Cell(ABC):
         return self._recorded({"failure": failure, "traceback": trace, "rows": []})
 
     def _recorded(self, found: Record) -> Record:
-        about = {"format": CELL_FORMAT, "id": self.id, "cell": self.names, "made": made(self.module)}
+        about = {"format": CELL_FORMAT, "id": self.id, "cell": self.names, "made": origin_of(self.module)}
         return dict(to_plain({**about, "failure": "", "traceback": "", **found}))
 
 
@@ -286,7 +283,7 @@ def workers(jobs: int = 1, cluster: str | None = None) -> Iterator[None]:
 class EstimatorCell(Cell):
     """An estimator with settings on the log of a drive."""
 
-    drive: Drive
+    drive: StudyDrive
     estimator: str
     variant: str
     """Name of the settings."""
@@ -294,29 +291,32 @@ class EstimatorCell(Cell):
     parameters: Any
     """Own ones of the estimator, a frozen dataclass; None where it has none."""
 
-    def work(self) -> Record:
-        """Run the estimator on the log, and return its metrics and, where they are kept, its files."""
-        log, hints = self.drive.load()
-        begin, worked = time.perf_counter(), time.thread_time()
-        result = run_estimator(self.estimator, self.settings, log, self.parameters)
-        wall, processor = time.perf_counter() - begin - result.observing, time.thread_time() - worked
-        cycles = online_cycles(result)
-        took = wall, sum(record.processor for record in cycles) if cycles else processor
-        said = [record.notice for record in result.cycles if record.notice]
-        vehicle = result.at_scale_one().vehicle
-        said += [] if vehicle is None else diagnose(vehicle, result.settings)
-        record: Record = {
-            "notices": "; ".join(dict.fromkeys(said)),
-            "lap_count": result.laps,
-            "rows": measure(result, log, took),
-            "stages": stage_times(cycles),
-        }
-        if self.keep:  # as texts: a worker may have no disk in common with the study
-            with tempfile.TemporaryDirectory() as place:
-                write_result(Path(place) / "run", result, summarize(result, log, hints))
-                files = (Path(place) / "run").iterdir()
-                record[FILES] = {file.name: file.read_text(encoding="utf-8") for file in files}
-        return record
+
+def estimator_record(
+    drive: StudyDrive, name: str, settings: MapperSettings, parameters: Any, keep: bool
+) -> Record:
+    """Run an estimator on a drive's log, and return its metrics and, where they are kept, its files."""
+    log, hints = drive.load()
+    begin, worked = time.perf_counter(), time.thread_time()
+    result = run_estimator(name, settings, log, parameters)
+    wall, processor = time.perf_counter() - begin - result.observing, time.thread_time() - worked
+    cycles = online_cycles(result)
+    took = wall, sum(record.processor for record in cycles) if cycles else processor
+    said = [record.notice for record in result.cycles if record.notice]
+    vehicle = result.at_scale_one().vehicle
+    said += [] if vehicle is None else diagnose(vehicle, result.settings)
+    record: Record = {
+        "notices": "; ".join(dict.fromkeys(said)),
+        "lap_count": result.laps,
+        "rows": measure(result, log, took),
+        "stages": stage_times(cycles),
+    }
+    if keep:  # as texts: a worker may have no disk in common with the study
+        with tempfile.TemporaryDirectory() as place:
+            write_result(Path(place) / "run", result, summarize(result, log, hints))
+            files = (Path(place) / "run").iterdir()
+            record[FILES] = {file.name: file.read_text(encoding="utf-8") for file in files}
+    return record
 
 
 def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any = None) -> RunResult:
@@ -328,17 +328,6 @@ def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any
     result = run_online(log, estimator, name=name, snapshot_times=lap_times(log), observers=observers)
     result = replace(result, reach=times(observers[0].rows, (1, 2, 0), log.scale)) if observers else result
     return with_own(result, parameters)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FunctionCell(Cell):
-    """A function of a module that returns rows, with its arguments."""
-
-    function: RowsOf
-    arguments: Mapping[str, Any]
-
-    def work(self) -> Record:
-        return {"rows": self.function(**self.arguments)}
 
 
 def rows_of(
@@ -355,16 +344,19 @@ def rows_of(
     With a `folder` they are kept there, so that a study that was killed goes on. `depends` is what the rows
     depend on beside the arguments and the code of the module.
     """
-    code, cells = code_from(function.__module__), list[FunctionCell]()
+    code, cells = code_from(function.__module__), list[Cell]()
+
+    def work(of: Mapping[str, Any]) -> Record:
+        return {"rows": function(**of)}
+
     for of in arguments:
-        cell = FunctionCell(
+        cell = Cell(
             module=function.__module__,
             names={name: value for name, value in of.items() if isinstance(value, str | int | float)},
             meaning=str(joblib.hash([function.__qualname__, dict(of), depends])),
             code=code,
             began=here(),
-            function=function,
-            arguments=of,
+            work=partial(work, of),
         )
         cells.append(cell)
     with tempfile.TemporaryDirectory() if folder is None else nullcontext(folder) as place, workers(jobs):
@@ -436,6 +428,7 @@ def make_plan(study: Study, *, keep: bool = False) -> Plan:
             meaning=identity(drive=drive.id, estimator=estimator, settings=read, own=own),
             code=code[estimator],
             began=here(),
+            work=partial(estimator_record, drive, estimator, settings, parameters, keep),
             keep=keep,
             drive=drive,
             estimator=estimator,

@@ -37,8 +37,6 @@ PRESET: Final = "preset"  # entry of a noise that names a preset, as in `sensor.
 ALL: Final = "all"  # name that stands for all known estimators
 RECORDED: Final = "recorded"  # noise of a drive that was not simulated
 TRACK_SUFFIXES: Final = (".yaml", ".yml", ".csv")
-RESOLUTION: Final = 1e-3  # length (m) and angle (rad) to which the geometry of a track identifies it
-ROUNDING: Final = 1.0 / np.pi  # shift that keeps coordinates of few decimals off the edges of millimetres
 MAX_VARIANTS: Final = 10_000  # of the grid of a study
 _LISTS: Final = ("tracks", "seeds", "estimators", "metrics")
 _latest: dict[str, tuple[Log, Sequence[Hint]]] = {}  # the log that was asked for last, by its drive
@@ -48,7 +46,7 @@ _latest: dict[str, tuple[Log, Sequence[Hint]]] = {}  # the log that was asked fo
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class StudyDrive:
     """A log that is simulated or recorded, as a study names it."""
 
     track: str
@@ -70,26 +68,26 @@ class Drive:
         return _latest[self.id]
 
 
-def simulated_drive(track: Track, seed: int, noise: str, simulation: SimulationSettings) -> Drive:
+def simulated_drive(track: Track, seed: int, noise: str, simulation: SimulationSettings) -> StudyDrive:
     """Return a drive whose seed depends on the track: those of several tracks are independent samples."""
     digest = track_digest(track)
     own = int(identity(track=digest, seed=seed)[:8], 16)
     meaning = identity(track=digest, seed=own, simulation=asdict(simulation))
     read = partial(_simulated, track, simulation, own)
-    return Drive(track.name, seed, noise, str(own), meaning, read, simulation)
+    return StudyDrive(track.name, seed, noise, str(own), meaning, read, simulation)
 
 
 def _simulated(track: Track, simulation: SimulationSettings, seed: int) -> tuple[Log, Sequence[Hint]]:
     return simulate(track, simulation, seed), ()
 
 
-def recorded_drive(track: str, number: int, folder: Path, limits: LimitSettings) -> Drive:
+def recorded_drive(track: str, number: int, folder: Path, limits: LimitSettings) -> StudyDrive:
     """Return the drive of a log's folder, one of those that were driven on a track."""
     digest = hashlib.sha256()
     for file in (folder / name for name in FILES):
         digest.update(file.name.encode() + (file.read_bytes() if file.exists() else b""))
     read = partial(read_plausible_log, folder, limits)
-    return Drive(track, number, RECORDED, folder.resolve().name, digest.hexdigest()[:20], read)
+    return StudyDrive(track, number, RECORDED, folder.resolve().name, digest.hexdigest()[:20], read)
 
 
 def track_digest(track: Track) -> str:
@@ -98,7 +96,8 @@ def track_digest(track: Track) -> str:
     The last digits of a generated track depend on the processor; the seeds of its drives do not.
     """
     parts = (track.left, track.right, track.other, track.start, track.cone_labels)
-    rounded = (np.floor(np.asarray(part) / RESOLUTION + ROUNDING).astype("<i8") for part in parts)
+    # the shift keeps coordinates of few decimals off the edges of millimetres
+    rounded = (np.floor(np.asarray(part) / 1e-3 + 1.0 / np.pi).astype("<i8") for part in parts)
     cones = b"|".join(part.tobytes() for part in rounded)
     return hashlib.sha256(cones + str(track.closed).encode()).hexdigest()[:20]
 
@@ -128,23 +127,23 @@ def load_tracks(tracks: Iterable[Path | int]) -> list[Track]:
             every += files
         else:
             raise InputError(entry, f"expected track files ({', '.join(TRACK_SUFFIXES)}), found none")
-    stems = [track.stem for track in every if isinstance(track, Path)]
-    return [_load(track, stems) for track in every]
-
-
-def _load(track: Path | int, stems: list[str]) -> Track:
-    if isinstance(track, int):
-        return replace(generate_track(np.random.default_rng(track)), name=f"generated {track}")
-    if track.name in EVENTS and not track.exists():
-        return EVENTS[track.name]()
-    if not track.exists() and track.parent.is_dir():
-        beside = sorted(entry.name for entry in track.parent.iterdir() if entry.suffix == track.suffix)
-        try:
-            check_name(track.name, beside, "expected a track file")
-        except SettingsError as error:
-            raise InputError(track, str(error)) from error
-    folder = f"{track.resolve().parent.name}/" if stems.count(track.stem) > 1 else ""
-    return replace(read_track(track), name=f"{folder}{track.stem}")
+    stems, found = [track.stem for track in every if isinstance(track, Path)], list[Track]()
+    for track in every:
+        if isinstance(track, int):
+            generated = generate_track(np.random.default_rng(track))
+            found.append(replace(generated, name=f"generated {track}"))
+        elif track.name in EVENTS and not track.exists():
+            found.append(EVENTS[track.name]())
+        else:
+            if not track.exists() and track.parent.is_dir():
+                beside = sorted(one.name for one in track.parent.iterdir() if one.suffix == track.suffix)
+                try:
+                    check_name(track.name, beside, "expected a track file")
+                except SettingsError as error:
+                    raise InputError(track, str(error)) from error
+            folder = f"{track.resolve().parent.name}/" if stems.count(track.stem) > 1 else ""
+            found.append(replace(read_track(track), name=f"{folder}{track.stem}"))
+    return found
 
 
 # --- studies -----------------------------------------------------------------------------------------------
@@ -385,7 +384,17 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
         check_name(key, _KINDS, "expected a known key")
         values[key] = _typed(key, [ALL] if given == ALL and key in _LISTS else given, _KINDS[key])
     values["tracks"] = [folder / t if isinstance(t, str) else t for t in values.get("tracks", ())]
-    values["logs"] = _logs(values.pop("drives", {}), folder)
+    drives = values.pop("drives", {})
+    for key in drives:
+        check_name(key, ("logs",), "drives: expected a known key")
+    given = drives.get("logs", [])
+    several = given if isinstance(given, Mapping) else {"": given}
+    values["logs"] = {}  # from a list each is of a track of its own, from a table of that of its list
+    for track, paths in several.items():
+        key = f"drives.logs.{track}".rstrip(".")
+        own = [folder / _typed(key, path, str) for path in _typed(key, paths, list)]
+        logs = tuple(log for path in own for log in log_folders(path).values())
+        values["logs"] |= {track: logs} if isinstance(given, Mapping) else {log.name: (log,) for log in logs}
     given = flatten(values.get("settings", {}))
     overrides, values["own"] = apart(given, registry.known_estimators(), MapperSettings())
     values["settings"] = override(MapperSettings(), overrides, "settings")
@@ -404,21 +413,6 @@ def study_from(content: Mapping[str, Any], folder: Path = Path(), name: str = "s
     except msgspec.ValidationError as error:
         raise SettingsError(f"published: {error}") from error
     return Study(**values | {"baseline": Baseline(**baseline)})
-
-
-def _logs(drives: Mapping[str, Any], folder: Path) -> dict[str, tuple[Path, ...]]:
-    """Return logs by their track: from a list, each of a track of its own, or from a table of lists."""
-
-    def paths(key: str, values: Any) -> tuple[Path, ...]:
-        given = [folder / _typed(key, value, str) for value in _typed(key, values, list)]
-        return tuple(log for path in given for log in log_folders(path).values())
-
-    for key in drives:
-        check_name(key, ("logs",), "drives: expected a known key")
-    logs = drives.get("logs", [])
-    if isinstance(logs, Mapping):
-        return {track: paths(f"drives.logs.{track}", own) for track, own in logs.items()}
-    return {log.name: (log,) for log in paths("drives.logs", logs)}
 
 
 def _typed(key: str, value: Any, kind: type) -> Any:

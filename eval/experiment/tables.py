@@ -4,12 +4,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
-from rich.table import Table as RichTable
+from rich.table import Table
 from rich.text import Text
 from scipy import stats
 from tabulate import LATEX_ESCAPE_RULES
@@ -31,19 +31,6 @@ ROUND_OFF: Final = 1e-12  # share of differences below which they are all the sa
 
 MADE: Final = ("commit", "host", "processor", "blas", "date", "command")  # where and when a run was made
 RATIO: Final = "ratio"  # note of a ratio of two estimators beside a published one
-MEAN_DIGITS: Final = 2  # least number of digits after the decimal point of a mean beside its difference
-MAX_PANELS: Final = 3  # most metrics side by side in the figure of differences
-FORMS: Final = {"txt": "simple", "md": "pipe"}  # form in tabulate by the suffix of a file
-_UNICODE: Final = str.maketrans(  # LaTeX for characters that not every font has
-    {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$", "×": r"$\times$"}
-)
-
-
-class Estimate(NamedTuple):
-    """Mean and its 95 % interval over independent samples."""
-
-    mean: float  # NaN without samples
-    half: float  # half the width of the interval; NaN for fewer than two samples
 
 
 def by_track(values: pd.Series) -> pd.Series:
@@ -56,15 +43,18 @@ def by_track(values: pd.Series) -> pd.Series:
     return tracks if len(tracks) > 1 else values
 
 
-def estimate(values: ArrayLike) -> Estimate:
-    """Return the mean m of independent values (n,) that are known, and Student's `m -+ t s / sqrt(n)`."""
+def estimate(values: ArrayLike) -> tuple[float, float]:
+    """Return the mean m of independent values (n,) that are known, and the half width of its interval.
+
+    It is Student's `t s / sqrt(n)`. The mean is NaN without values, the half width for fewer than two.
+    """
     known = np.asarray(values, float)
     known = known[np.isfinite(known)]
     n = len(known)
     if n < 2:
-        return Estimate(float(known[0]) if n else float("nan"), float("nan"))
+        return float(known[0]) if n else float("nan"), float("nan")
     half = stats.t.ppf(0.5 + LEVEL / 2, n - 1) * stats.sem(known)
-    return Estimate(float(np.mean(known)), float(half))
+    return float(np.mean(known)), float(half)
 
 
 def paired_p(differences: Array) -> float:
@@ -116,29 +106,14 @@ def names_of(frame: pd.DataFrame, otherwise: str) -> list[str]:
     return [name for name in COMBINATION if frame[name].nunique() > 1] or [otherwise]
 
 
-@dataclass(frozen=True)
-class Contrast:
-    """One metric of one combination, and its difference from the baseline, drive by drive."""
+def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """Compare each combination with the baseline of its noise: a row for each, in the study's order.
 
-    noise: str
-    estimator: str
-    variant: str
-    metric: str  # key of the metric
-    runs: int  # number of runs with a value at the end of their last lap
-    value: Estimate  # mean over the tracks
-    difference: Estimate | None  # mean over the tracks; None for the baseline itself
-    differences: tuple[float, ...] = ()  # of each track, or of each drive of a single track
-    p: float = float("nan")  # p of the paired t-test over them, corrected for all hypotheses of the metric
-    wilcoxon: float = float("nan")  # p of Wilcoxon's signed-rank test over them, not corrected
-
-    @property
-    def significant(self) -> bool:
-        """Whether chance alone rarely makes such a difference anywhere in the study."""
-        return bool(self.p < 1.0 - LEVEL)
-
-
-def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
-    """Return every combination against the baseline of its noise, in the study's order.
+    It has the number of `runs` with a value at the end of their last lap, the `mean` over the tracks and
+    `half` its interval, the same of the `difference` from the baseline (NaN for the baseline itself), and
+    the `differences` of each track, or of each drive of a single one. `p` is that of the paired t-test over
+    them, corrected for all hypotheses of the metric, and `wilcoxon` that of the signed-rank test, not
+    corrected. Where it is `significant`, chance alone rarely makes such a difference anywhere in the study.
 
     Nothing is tested where all differences are 0, as between cells that mean the same, nor of a wall time,
     which depends on what else the machine does. The cells of a drive are run one after another, so that
@@ -147,26 +122,27 @@ def contrasts(study: Study, frame: pd.DataFrame, metric: str) -> list[Contrast]:
     known = last_laps(frame).astype({metric: float}).dropna(subset=[metric])
     runs = {key: of.set_index([*RUN])[metric] for key, of in known.groupby([*COMBINATION], sort=False)}
     nothing = pd.Series(dtype=float, index=pd.MultiIndex.from_arrays([[], []], names=RUN))
-    contrasted = []
+    rows = []
     for key in product(study.noises, study.estimators, study.points):
         base = (key[0], study.baseline.estimator or key[1], study.baseline_variant)
         values, against = runs.get(key, nothing), runs.get(base, nothing)
-        contrast = Contrast(*key, metric, len(values), estimate(by_track(values)), None)
-        if key != base:
-            d = by_track((values - against).dropna()).to_numpy()
-            contrast = replace(contrast, difference=estimate(d), differences=tuple(d.tolist()))
-            if d.any() and METRICS[metric].time != "wall":
-                contrast = replace(contrast, p=paired_p(d), wilcoxon=wilcoxon_p(d))
-        contrasted.append(contrast)
-    corrected = holm(np.array([contrast.p for contrast in contrasted]))
-    return [replace(contrast, p=float(p)) for contrast, p in zip(contrasted, corrected, strict=True)]
+        d = np.zeros(0) if key == base else by_track((values - against).dropna()).to_numpy()
+        is_tested = d.any() and METRICS[metric].time != "wall"
+        tests = (paired_p(d), wilcoxon_p(d)) if is_tested else (np.nan, np.nan)
+        rows.append(
+            (*key, key == base, len(values), *estimate(by_track(values)), *estimate(d), tuple(d), *tests)
+        )
+    columns = (*COMBINATION, "is_baseline", "runs", "mean", "half", "difference", "difference_half")
+    found = pd.DataFrame(rows, columns=[*columns, "differences", "p", "wilcoxon"])
+    found["p"] = holm(found["p"].to_numpy())
+    return found.assign(significant=found["p"] < 1.0 - LEVEL)
 
 
 # --- tables of texts -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class TextTable:
     """Texts in columns below a title: first names, left-aligned, then figures, right-aligned."""
 
     frame: pd.DataFrame
@@ -195,9 +171,9 @@ class Table:
             rows.append((row[name], column, value, half))
         return pd.DataFrame(rows, columns=[name, "column", "value", "half_width"])
 
-    def rich(self) -> RichTable:
+    def rich(self) -> Table:
         """Return the table for a terminal, without its title; units in brackets aren't taken for markup."""
-        table = RichTable()
+        table = Table()
         for number, name in enumerate(self.frame):
             table.add_column(Text(name), justify="left" if number < self.names else "right")
         for row in self.frame.itertuples(index=False):
@@ -205,14 +181,14 @@ class Table:
         return table
 
     def text(self, form: str = "txt") -> str:
-        """Return the table for a file of this suffix, by `FORMS`, or as LaTeX."""
+        """Return the table for a file of this suffix: plain text, Markdown or LaTeX."""
         if form == "tex":
             return self.latex()
         sides = ["left"] * self.names + ["right"] * (self.frame.shape[1] - self.names)
         frame = self.frame.replace(r"\|", r"\|", regex=True) if form == "md" else self.frame
-        how: dict[str, Any] = {"tablefmt": FORMS[form], "colalign": sides, "disable_numparse": True}
+        how: dict[str, Any] = {"tablefmt": "pipe" if form == "md" else "simple", "disable_numparse": True}
         above = f"{self.title}\n\n" if self.title else ""
-        return f"{above}{frame.to_markdown(index=False, **how)}\n"
+        return f"{above}{frame.to_markdown(index=False, colalign=sides, **how)}\n"
 
     def latex(self) -> str:
         """Return a `table` environment in LaTeX, with the title as its caption; it needs booktabs."""
@@ -224,7 +200,9 @@ class Table:
         sides = "l" * self.names + "r" * (self.frame.shape[1] - self.names)
         above = {"caption": caption, "label": self.label or None, "position_float": "centering"}
         text = shown.to_latex(hrules=True, column_format=sides, **above)
-        return f"% \\usepackage{{booktabs}}\n{text}".translate(_UNICODE)
+        # characters that not every font has
+        known: dict[str, Any] = {"–": "--", "σ": r"$\sigma$", "−": "$-$", "±": r"$\pm$", "²": r"$^2$"}
+        return f"% \\usepackage{{booktabs}}\n{text}".translate(str.maketrans(known | {"×": r"$\times$"}))
 
     def write(self, folder: Path, name: str, *suffixes: str) -> None:
         """Write the table to a folder as `txt`, `md` or `tex`."""
@@ -245,17 +223,17 @@ def mean(metric: Metric, runs: pd.DataFrame) -> str:
     return metric.text(*estimate(values))
 
 
-def by_metric(parts: Mapping[str, pd.DataFrame], metrics: Sequence[Metric]) -> Table:
+def by_metric(parts: Mapping[str, pd.DataFrame], metrics: Sequence[Metric]) -> TextTable:
     """Return a row for each metric, and a column for each part of the runs."""
     rows = ((metric.heading, *(mean(metric, runs) for runs in parts.values())) for metric in metrics)
-    return Table.of(("metric", *parts), rows)
+    return TextTable.of(("metric", *parts), rows)
 
 
-def by_name(frame: pd.DataFrame, names: Sequence[str], metrics: Sequence[Metric]) -> Table:
+def by_name(frame: pd.DataFrame, names: Sequence[str], metrics: Sequence[Metric]) -> TextTable:
     """Return a row for the rows of a frame with each value of the columns `names`."""
     groups = frame.groupby([*names], sort=False)
     rows = ((", ".join(map(str, of)), *(mean(metric, runs) for metric in metrics)) for of, runs in groups)
-    return Table.of((", ".join(names), *(metric.heading for metric in metrics)), rows)
+    return TextTable.of((", ".join(names), *(metric.heading for metric in metrics)), rows)
 
 
 # --- tables of studies -----------------------------------------------------------------------------------
@@ -264,66 +242,67 @@ def by_name(frame: pd.DataFrame, names: Sequence[str], metrics: Sequence[Metric]
 def _shown(frame: pd.DataFrame, keys: Iterable[str]) -> list[Metric]:
     """Return the metrics that a frame has; beside differences a mean has at least two digits."""
     known = (METRICS[key] for key in keys if key in frame)
-    return [replace(metric, digits=max(metric.digits, MEAN_DIGITS)) for metric in known]
+    return [replace(metric, digits=max(metric.digits, 2)) for metric in known]
 
 
 def results_table(
     study: Study, frame: pd.DataFrame, keys: Sequence[str] = (), label: str = "tab:results"
-) -> Table:
+) -> TextTable:
     """Return a row for each combination and a column for each metric, by default those of the study.
 
     A cell is the mean and its interval over the tracks, at the end of the last lap. The best mean of a noise
     is bold, where a metric has a best.
     """
-    shown = _shown(frame, keys or study.metrics)
-    names, rows, best = names_of(frame, "estimator"), dict[str, list[str]](), dict[str, list[bool]]()
-    for metric in shown:
-        column = contrasts(study, frame, metric.key)
-        rows |= {name: [getattr(one, name) for one in column] for name in names}
-        rows[metric.heading] = [metric.text(*one.value) for one in column]
+    names, texts, best = names_of(frame, "estimator"), pd.DataFrame(), pd.DataFrame()
+    for metric in _shown(frame, keys or study.metrics):
+        found = contrasts(study, frame, metric.key)
+        texts[names] = found[names]
+        texts[metric.heading] = [metric.text(*pair) for pair in found[["mean", "half"]].to_numpy()]
         sign = (metric.best == "least") - (metric.best == "most")
-        means = pd.Series([sign * one.value.mean for one in column])
-        of_noise = means.groupby([one.noise for one in column])
+        means = sign * found["mean"]
+        of_noise = means.groupby(found["noise"])
         differs = (of_noise.transform("nunique") > 1) & bool(sign)
-        best[metric.heading] = (differs & (means == of_noise.transform("min"))).tolist()
-    texts = pd.DataFrame(rows)
+        best[metric.heading] = differs & (means == of_noise.transform("min"))
     laps = f", at the end of the last of {study.laps} laps" if study.tracks else ""
     title = f"{f'{study.name}: {study.question}'.strip()} Mean and {_interval(frame)}{laps}."
-    bold = pd.DataFrame(best).reindex(columns=texts.columns, fill_value=False)
-    return Table(texts, title, len(names), label, bold)
+    bold = best.reindex(columns=texts.columns, fill_value=False)
+    return TextTable(texts, title, len(names), label, bold)
 
 
-def summary_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
+def summary_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
     """Return a table for each metric of the study that its runs have: each combination by the baseline."""
     names, tables = names_of(frame, "variant"), []
     for metric in _shown(frame, study.metrics):
         rows = []
-        for one in contrasts(study, frame, metric.key):
-            by = "baseline" if one.difference is None else metric.text(*one.difference, sign="+")
+        found: Any = contrasts(study, frame, metric.key).itertuples()
+        for one in found:
+            difference = metric.text(one.difference, one.difference_half, sign="+")
+            by = "baseline" if one.is_baseline else difference
             tested = (_p(one.p), _p(one.wilcoxon), "*" if one.significant else "")
-            value = str(one.runs), metric.text(*one.value)
+            value = str(one.runs), metric.text(one.mean, one.half)
             rows.append((*(getattr(one, name) for name in names), *value, by, *tested))
         header = (*names, "runs", "mean", "difference", "p", "Wilcoxon", "")
-        tables.append(Table.of(header, rows, metric.heading, len(names)))
+        tables.append(TextTable.of(header, rows, metric.heading, len(names)))
     return tables
 
 
-def contrast_table(study: Study, frame: pd.DataFrame) -> Table:
+def contrast_table(study: Study, frame: pd.DataFrame) -> TextTable:
     """Return each combination: the first metric of the study, its paired difference and p, and the others."""
     names, last = names_of(frame, "variant"), last_laps(frame)
     first, *others = (METRICS[key] for key in study.metrics if key in frame and key not in TIMES)
+    found: Any = contrasts(study, frame, first.key).itertuples()
     rows = []
-    for one in contrasts(study, frame, first.key):
+    for one in found:
         values = [getattr(one, name) for name in names]
         runs = last[(last[names] == values).all(axis=1)]
-        difference = first.text(*estimate(one.differences))
+        difference = first.text(one.difference, one.difference_half)
         rest = (mean(other, runs) for other in others)
         rows.append((", ".join(values), mean(first, runs), difference, figure(one.p), *rest))
     headings = (first.heading, "difference", "p", *(other.heading for other in others))
-    return Table.of((", ".join(names), *headings), rows)
+    return TextTable.of((", ".join(names), *headings), rows)
 
 
-def track_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
+def track_tables(study: Study, frame: pd.DataFrame) -> list[TextTable]:
     """Return a table for each combination, track by track: the metrics of its runs at their last lap."""
     shown = [METRICS[key] for key in study.metrics if key in frame]
     header, titles = ("track", "runs", *(metric.heading for metric in shown)), names_of(frame, "estimator")
@@ -334,7 +313,7 @@ def track_tables(study: Study, frame: pd.DataFrame) -> list[Table]:
             last, count = last_laps(of), len(of.groupby([*RUN]))
             values = (metric.text(metric.over(last[metric.key].astype(float))) for metric in shown)
             rows.append((str(track), f"{len(last)} of {count}", *values))
-        tables.append(Table.of(header, rows, ", ".join(str(runs[name].iloc[0]) for name in titles)))
+        tables.append(TextTable.of(header, rows, ", ".join(str(runs[name].iloc[0]) for name in titles)))
     return tables
 
 
@@ -408,7 +387,7 @@ def caption(study: Study, frame: pd.DataFrame) -> str:
     )
 
 
-def joined(tables: Sequence[Table], caption: str, form: str) -> str:
+def joined(tables: Sequence[TextTable], caption: str, form: str) -> str:
     """Return the tables of a study in a form, below their caption; in LaTeX each has it."""
     if form == "tex":
         return "\n".join(replace(table, title=f"{table.title}. {caption}").latex() for table in tables)
@@ -426,36 +405,36 @@ def plot_differences(study: Study, frame: pd.DataFrame) -> style.Picture:
     The panels are the first metrics in which any run differs; where none does, there are means in their
     place.
     """
-    every = [contrasts(study, frame, metric) for metric in study.metrics if metric in frame]
-    panels = [p for p in every if any(d != 0.0 for contrast in p for d in contrast.differences)][:MAX_PANELS]
-    differ, panels = bool(panels), panels or every[:MAX_PANELS]
-    rows = [i for i in range(len(panels[0])) if not differ or any(panel[i].differences for panel in panels)]
+    every = {key: contrasts(study, frame, key) for key in study.metrics if key in frame}
+    differing = [key for key, found in every.items() if any(map(any, found["differences"]))]
+    panels = {key: every[key] for key in (differing or [*every])[:3]}
+    compared = np.any([found["differences"].map(len) > 0 for found in panels.values()], axis=0)
+    rows = np.flatnonzero(compared | (not differing)).tolist()
     with style.figure_context():
         figure = style.Picture(figsize=(WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
         all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-        for axes, panel in zip(all_axes, panels, strict=True):
-            metric, rng = METRICS[panel[0].metric], np.random.default_rng(0)
-            if differ:
+        for axes, (key, found) in zip(all_axes, panels.items(), strict=True):
+            metric, rng = METRICS[key], np.random.default_rng(0)
+            if differing:
                 axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
-            for row, contrast in enumerate(panel[i] for i in rows):
-                shown = contrast.difference if differ else contrast.value
-                if shown is None or np.isnan(shown.mean):
+            for row, (_, one) in enumerate(found.iloc[rows].iterrows()):
+                mean, half = one[["difference", "difference_half"] if differing else ["mean", "half"]]
+                if np.isnan(mean):
                     continue
-                color = BLUE if contrast.significant else GREY
-                pairs = metric.factor * np.array(contrast.differences)
+                color = BLUE if one["significant"] else GREY
+                pairs = metric.factor * np.array(one["differences"])
                 scattered = row + rng.uniform(-0.22, 0.22, len(pairs))  # so that they can be seen apart
                 axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=3.5, zorder=2)
-                mean, half = metric.factor * shown.mean, metric.factor * shown.half
+                xerr = None if np.isnan(half) else metric.factor * half
                 look: dict[str, Any] = {"color": color, "markersize": 4.5, "elinewidth": 1.0, "zorder": 3}
-                axes.errorbar(mean, row, xerr=None if np.isnan(half) else half, fmt="o", **look)
+                axes.errorbar(metric.factor * mean, row, xerr=xerr, fmt="o", **look)
             axes.set_title(metric.heading)
             axes.grid(axis="x")
-        differing = names_of(frame, "variant")
-        names = [", ".join(getattr(panels[0][i], name) for name in differing) for i in rows]
-        all_axes[0].set_yticks(range(len(rows)), names)
+        names = next(iter(panels.values()))[names_of(frame, "variant")].iloc[rows]
+        all_axes[0].set_yticks(range(len(rows)), names.agg(", ".join, axis=1))
         all_axes[0].set_ylim(len(rows) - 0.5, -0.5)
         text = "difference from the baseline: each pair, mean and 95 % interval; blue where significant"
-        figure.supxlabel(text if differ else "mean and 95 % interval")
+        figure.supxlabel(text if differing else "mean and 95 % interval")
     return figure
 
 
@@ -469,7 +448,7 @@ def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     figures = {"differences": plot_differences(study, frame)}
     if study.published.laps and len(beside := beside_published(study, frame)):
         texts = beside.map(lambda x: figure(x) if isinstance(x, float) else str(x))
-        tables.append(Table(texts, f"Beside {study.published.source}", 3))
+        tables.append(TextTable(texts, f"Beside {study.published.source}", 3))
         write_csv(out / "published.csv", beside)
         figures["published"] = plot_published(beside)
     for form in ("txt", "md", "tex"):

@@ -27,7 +27,6 @@ TRAJECTORY_COLOR: Final = GREEN
 HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
 LABEL_COLORS: Final = {**BOUNDARY_COLORS, UNKNOWN: GREY, **dict.fromkeys(POINTS, RED)}
 BAND_ALPHA: Final = 0.35
-TENTATIVE_DASHES: Final = (0, (4, 2))  # dashes of the stretch of a curve that is not confirmed
 PATH_WIDTH: Final = 0.6  # width of the trajectory (pt); the true path is thinner
 LANDMARK_SIZE: Final = 1.4  # size of landmarks (pt), small enough for their ellipses to be seen
 
@@ -97,7 +96,7 @@ def draw_boundary(axes: Axes, boundary: MapBoundary, label: int, band_scale: flo
     until = boundary.confirmed_until
     style.draw_curve(axes, spline, color, f"{name} boundary", stretch=(-np.inf, until), zorder=4)
     if until < spline.domain[1]:
-        dashed: dict[str, Any] = {"linestyle": TENTATIVE_DASHES, "zorder": 4}
+        dashed: dict[str, Any] = {"linestyle": (0, (4, 2)), "zorder": 4}
         style.draw_curve(axes, spline, color, f"{name} tentative", stretch=(until, np.inf), **dashed)
     squares: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 0.6, "zorder": 5}
     points, text = spline.distinct_control_points, f"{name} control points"

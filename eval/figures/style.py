@@ -22,9 +22,7 @@ from pathspace_graph.labels import BOUNDARIES, NAMES
 from pathspace_graph.spline.bspline import BSpline
 
 WIDTH: Final = 7.0  # width of a figure (in): two columns of a paper
-CURVE_WIDTH: Final = 0.7  # width of a curve (pt)
 MARKER_SIZE: Final = 2.6  # size of a control point or a detection (pt)
-ALPHA: Final = 0.25
 
 BLUE: Final = "#0067A9"
 ORANGE: Final = "#D98200"
@@ -52,7 +50,6 @@ _RC: Final = {
     "legend.columnspacing": 1.4,
 }
 SIGMAS: Final = 2.0  # standard deviations to the edge of a band or an ellipse
-WIDEST: Final = 3.0  # half width of a band (m) beyond which its curve is not known, and at which it is cut
 FORMATS: Final = (".png", ".pdf", ".svg")  # suffixes under which a figure can be saved
 SUFFIXES: Final = (".png", ".pdf")  # formats of commands that write several figures: to look at, to print
 DPI: Final = 200.0  # resolution of a png (dots per inch)
@@ -101,9 +98,12 @@ def curve_parameters(spline: BSpline, samples_per_span: int = 24) -> Array:
 
 
 def uncertainty_band(boundary: SplineBoundary, u: Array, scale: float = 1.0) -> tuple[Array, Array]:
-    """Return the left and right edge (k, 2), S(u) +- scale min(2 sigma(u), WIDEST) n(u)."""
+    """Return the left and right edge (k, 2), S(u) +- scale min(2 sigma(u), 3 m) n(u).
+
+    A curve with a wider band is not known.
+    """
     spline = boundary.spline
-    half = scale * np.minimum(SIGMAS * spline.normal_sigma(u, boundary.covariance), WIDEST)
+    half = scale * np.minimum(SIGMAS * spline.normal_sigma(u, boundary.covariance), 3.0)
     offsets = half[:, None] * spline.normal_unit(u)
     centre = spline.evaluate(u)
     return centre + offsets, centre - offsets
@@ -114,7 +114,7 @@ def draw_curve(
     spline: BSpline,
     color: str,
     label: str | None = None,
-    width: float = CURVE_WIDTH,
+    width: float = 0.7,
     stretch: tuple[float, float] = (-np.inf, np.inf),
     **line: Any,
 ) -> None:
@@ -147,7 +147,7 @@ def draw_band(
     if boundary.spline.periodic:  # a ring, with edges in opposite directions
         edges = Outline(left, closed=True), Outline(right[::-1], closed=True)
         outline = Outline.make_compound_path(*edges)
-    look: dict[str, Any] = {"alpha": ALPHA, "linewidth": 0.0, "zorder": 2} | options
+    look: dict[str, Any] = {"alpha": 0.25, "linewidth": 0.0, "zorder": 2} | options
     axes.add_patch(PathPatch(outline, facecolor=color, label=label, **look))
 
 

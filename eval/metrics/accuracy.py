@@ -22,9 +22,7 @@ from pathspace_graph.spline.bspline import BSpline
 
 MISSED_DISTANCE: Final = 3.0  # distance from its boundary beyond which a cone is missed (m; Table 1)
 GHOST_DISTANCE: Final = 2.0  # distance from its boundary beyond which a mapped point is a ghost (m)
-TRUE_STEP: Final = 0.02  # largest step on a true curve (m): 0.1 m is at most 0.5 mm too long
 MAPPED_STEP: Final = 0.1  # largest step on a mapped curve (m)
-GRID_PER_SPAN: Final = 64  # grid points of a span for closest points, about every 0.1 m
 _OVERLAP: Final = 3  # cones beyond the seam that Akima's tangents of a closed curve need
 
 
@@ -90,7 +88,7 @@ def closest_points(spline: BSpline, points_map: Array) -> FootPoints:
     Exact, except where two stretches are equally near to about the sagitta of the grid.
     """
     low, high = spline.domain
-    step = (high - low) / (GRID_PER_SPAN * (len(spline.breaks) - 1))
+    step = (high - low) / (64 * (len(spline.breaks) - 1))  # about 0.1 m
     lows, highs = np.full(len(points_map), low), np.full(len(points_map), high)
     return foot_points(spline.tables, spline.control_points, points_map, lows, highs, step)
 
@@ -116,14 +114,14 @@ def true_lap_ends(truth: Truth) -> IntArray:
 
 
 @lru_cache(maxsize=16)
-def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
+def true_curve(truth: Truth, label: int, step: float = 0.02) -> Array:
     """Return points (k, 2) in m, at most `step` apart, on the curve through the true cones of a boundary.
 
     Akima's cubic over chord lengths, in driving order: it passes through every cone and, unlike a natural
     spline, doesn't overshoot where their spacing changes. It is closed where the true path completes a lap.
     The array is cached and must not be written to.
     """
-    cones = driving_order(truth, label)
+    cones = cones_in_order(truth, label)
     if len(cones) < 2:
         return cones
     closed = len(cones) > _OVERLAP and len(true_lap_ends(truth)) > 0
@@ -136,7 +134,7 @@ def true_curve(truth: Truth, label: int, step: float = TRUE_STEP) -> Array:
 
 
 @lru_cache(maxsize=16)
-def driving_order(truth: Truth, label: int) -> Array:
+def cones_in_order(truth: Truth, label: int) -> Array:
     """Return the true cones (k, 2) of one boundary in driving order; cached like `true_curve`.
 
     Sorted by the nearest point of the true path's first lap, or as in the file where that gives the shorter

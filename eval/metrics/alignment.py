@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import ClassVar, Final
 
+import gtsam
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
@@ -29,13 +30,7 @@ from pathspace_graph.labels import BOUNDARIES, NAMES
 from .accuracy import boundary_distances, cones_of, mapped_points, mean_of, root_mean_square
 from .consistency import near_pairs
 
-DIFFERENT: Final = 0.5  # distance of both curves from which on they differ (m): more than a refinement
 STEP: Final = 0.5  # distance of the points of a curve that are compared (m)
-AHEAD: Final = (0.0, -4.0, -2.0, 2.0, 4.0)  # where the other drive may have started, if in the same place (m)
-TURN: Final = np.deg2rad(2.0)  # step of the headings that are tried where it may have started anywhere
-TURNS: Final = 3  # best ones of these that are refined
-STEPS: Final = 30  # most steps of Gauss-Newton
-STILL: Final = 1e-6  # largest move of a step after which there is no further one (m, rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,23 +110,23 @@ def shape_rmse(track: Map, truth: Truth) -> float:
 
 def _starts(points: Sequence[Array], others: Sequence[Array]) -> list[Array]:
     """Return motions (3,) to begin with: about the same start, and about the same middle in any direction."""
-    starts = [np.array([ahead, 0.0, 0.0]) for ahead in AHEAD]
+    starts = [np.array([ahead, 0.0, 0.0]) for ahead in (0.0, -4.0, -2.0, 2.0, 4.0)]
     middle, target = (np.concatenate(of).mean(axis=0) for of in (points, others))
     trees, turned = [KDTree(own) for own in others], list[tuple[float, Array]]()
-    for turn in np.arange(0.0, 2.0 * np.pi, TURN).tolist():
+    for turn in np.arange(0.0, 2.0 * np.pi, np.deg2rad(2.0)).tolist():
         shift = target - move_points(np.array([0.0, 0.0, turn]), middle[None])[0]
         motion = np.append(shift, turn)
         pairs = zip(trees, points, strict=True)
         away = [tree.query(move_points(motion, own[::2]))[0] for tree, own in pairs]
         turned.append((mean_of(np.concatenate(away)), motion))
     turned.sort(key=lambda one: one[0])
-    return starts + [motion for _, motion in turned[:TURNS]]
+    return starts + [motion for _, motion in turned[:3]]
 
 
 def aligning(points: Sequence[Array], boundaries: Sequence[MapBoundary], start: Array) -> Array:
     """Return the motion (3,) that lays points (k, 2) on boundaries, by closest points within 3 m."""
     motion = start
-    for _ in range(STEPS):
+    for _ in range(30):
         rows, errors = [np.zeros((0, 3))], [np.zeros(0)]
         for own, boundary in zip(points, boundaries, strict=True):
             point, normal, position, _ = near_pairs(boundary, move_points(motion, own))
@@ -140,7 +135,7 @@ def aligning(points: Sequence[Array], boundaries: Sequence[MapBoundary], start: 
             errors.append(np.einsum("kd,kd->k", normal, position - point))
         step = np.linalg.lstsq(np.concatenate(rows), np.concatenate(errors), rcond=None)[0]
         motion = motion + step
-        if np.abs(step).max() < STILL:
+        if np.abs(step).max() < 1e-6:
             break
     return motion
 
@@ -168,12 +163,15 @@ class MapDifference:
 
 
 def differences(known: Map, found: Map) -> list[MapDifference]:
-    """Return the stretches of a found map that lie beside those of the known one, at scale 1."""
+    """Return the stretches of a found map that lie beside those of the known one, at scale 1.
+
+    They are more than half a metre off, which is more than a refinement.
+    """
     stretches = list[MapDifference]()
     for label in sorted(set(found.splines) & set(known.splines)):
         points = mapped_points(found.boundaries[label], STEP)
         away = boundary_distances(known.boundaries[label], points)
-        differs = away > DIFFERENT
+        differs = away > 0.5
         begins = np.flatnonzero(differs & ~np.append(False, differs[:-1]))
         for begin in begins.tolist():
             end = begin + int(np.append(differs[begin:], False).argmin())
@@ -188,15 +186,6 @@ def differences(known: Map, found: Map) -> list[MapDifference]:
 
 
 LEAST: Final = 6  # least number of cones of a registration, and of cycles in which a vehicle stands
-NEAR: Final = 12.0  # range within which cones tell that a vehicle stands (m)
-FAR: Final = 30.0  # range within which they are registered (m): farther ones scatter by metres
-GATES: Final = (2.5, 2.0, 1.5, 1.5, 1.5)  # distances of paired cones (m)
-SEEN_SHARE: Final = 0.2  # least share of the cycles in which a cone is seen
-HUBER: Final = 1.5  # whitened distance beyond which Huber's loss reduces the weight of a cone
-DRIFTED: Final = (2.0, 2.0, 0.1)  # standard deviations of dead reckoning at the end of a lap (m, m, rad)
-STAYS: Final = 0.5  # most median distance of a cycle's cones from those of one of the last (m)
-TOGETHER: Final = 9  # cycles that are looked at together
-MOST_STANDING: Final = 100  # most cycles in which it stands
 
 
 def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise | None) -> Array | None:
@@ -212,35 +201,41 @@ def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise | None
         return None
     start, end = ([_cones(own, label, noise) for label in BOUNDARIES] for own in sides)
     tries, reckoned = list[tuple[float, float, Array]](), cycles[-1].pose
+    drifted = (2.0, 2.0, 0.1)  # standard deviations of dead reckoning at the end of a lap (m, m, rad)
     for offset in product((-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-0.1, 0.0, 0.1)):
         score, pose = _registered(start, end, compose(reckoned, np.array(offset)))
-        drift = float(np.square(difference(pose, reckoned) / DRIFTED).sum())
+        drift = float(np.square(difference(pose, reckoned) / drifted).sum())
         tries.append((score - drift, score, pose))
     _, score, pose = max(tries, key=lambda one: one[0])
     return np.append(pose[:2], wrap_angle(pose[2:])) if score > 0.0 else None
 
 
 def standing(cycles: Sequence[SeenCycle]) -> list[SeenCycle]:
-    """Return the last of these cycles in which near cones stay where they are.
+    """Return the last of these cycles, at most 100, in which cones within 12 m stay where they are.
 
-    Odometry may go on while the vehicle stands, so the cones decide. Empty where they are too few cycles.
+    Odometry may go on while the vehicle stands, so the cones decide: their median distance from those of one
+    of the last cycles is under 0.5 m. Empty where they are too few cycles.
     """
-    near = [cycle.detections.points_vehicle for cycle in cycles[-MOST_STANDING:]]
-    near = [points[np.hypot(*points.T) < NEAR] for points in near]
-    most = KDTree(max(near[-TOGETHER:], key=len))
+    together = 9  # cycles that are looked at together, since single ones see few cones
+    near = [cycle.detections.points_vehicle for cycle in cycles[-100:]]
+    near = [points[np.hypot(*points.T) < 12.0] for points in near]
+    most = KDTree(max(near[-together:], key=len))
     moved = [np.median(most.query(points)[0]) if most.n and len(points) else np.inf for points in near]
-    stays = median_filter(np.array(moved) < STAYS, TOGETHER, mode="nearest")  # single cycles see few cones
-    count = int(np.argmin(stays[::-1])) - TOGETHER // 2 if not stays.all() else len(stays)
+    stays = median_filter(np.array(moved) < 0.5, together, mode="nearest")
+    count = int(np.argmin(stays[::-1])) - together // 2 if not stays.all() else len(stays)
     return list(cycles[-count:]) if count >= LEAST else []
 
 
 def _cones(cycles: Sequence[SeenCycle], label: int, noise: MeasuredNoise) -> tuple[Array, Array]:
-    """Return the cones (k, 2) of a vehicle that stands, vehicle frame, and their covariances (k, 2, 2)."""
+    """Return the cones (k, 2) of a vehicle that stands, vehicle frame, and their covariances (k, 2, 2).
+
+    They are within 30 m, since farther ones scatter by metres, and are seen in a fifth of the cycles.
+    """
     table = Sightings.of(sorted(cycles, key=lambda one: one.detections.t))
-    table = table.where((table.cone == label) & (np.hypot(*table.point.T) < FAR))
+    table = table.where((table.cone == label) & (np.hypot(*table.point.T) < 30.0))
     table = replace(table, pose=0.0 * table.pose, twist=0.0 * table.twist).tracked(noise)
     numbers, counts = np.unique(table.cone, return_counts=True)
-    points, seen_again = noise.corrected(table.point, np.zeros(3)), counts > SEEN_SHARE * len(cycles)
+    points, seen_again = noise.corrected(table.point, np.zeros(3)), counts > 0.2 * len(cycles)
     means = [points[table.cone == cone].mean(axis=0) for cone in numbers[seen_again]]
     cones, count = np.array(means).reshape(-1, 2), int(np.median(counts[seen_again])) if means else 1
     covariances = replace(noise, count=count).covariances(cones, inflated=True)
@@ -256,7 +251,7 @@ def _registered(
     Each paired cone adds 9 less its squared distance in sigmas.
     """
     score = 0.0
-    for gate in GATES:
+    for gate in (2.5, 2.0, 1.5, 1.5, 1.5):  # distance of paired cones (m)
         information, vector, score, count = 1e-9 * np.eye(3), np.zeros(3), 0.0, 0
         for (known, known_covariance), (seen, seen_covariance) in zip(start, end, strict=True):
             if not len(known) or not len(seen):
@@ -267,7 +262,7 @@ def _registered(
             off = points[rows] - known[nearest[rows]]
             W = np.linalg.inv(known_covariance[nearest[rows]] + rotated(seen_covariance[rows], pose[None, 2]))
             square = np.einsum("ki,kij,kj->k", off, W, off)
-            W *= huber_weights(np.sqrt(square), HUBER)[:, None, None]
+            W *= huber_weights(np.sqrt(square), 1.5)[:, None, None]
             J = np.concatenate(
                 [np.tile(np.eye(2), (len(rows), 1, 1)), left_of(points[rows] - pose[:2])[:, :, None]], axis=2
             )
@@ -282,8 +277,6 @@ def _registered(
 
 def motion_onto(points: Array, onto: Array) -> Array:
     """Return the motion (3,) that leads points (n, 2) onto others, by least squares (Umeyama 1991)."""
-    middle, goal = points.mean(axis=0), onto.mean(axis=0)
-    a, b = (points - middle) @ [1.0, 1j], (onto - goal) @ [1.0, 1j]
-    turn = float(np.angle(np.vdot(a, b)))
-    turned = complex(*middle) * np.exp(1j * turn)
-    return np.array([goal[0] - turned.real, goal[1] - turned.imag, turn])
+    motion = gtsam.Pose2.Align(np.asfortranarray(onto.T), np.asfortranarray(points.T))
+    assert motion is not None
+    return np.array([motion.x(), motion.y(), motion.theta()])

@@ -161,7 +161,6 @@ METRICS: Final[Mapping[str, Metric]] = {metric.key: metric for metric in _ALL}  
 # --- the measures of a run -------------------------------------------------------------------------------
 
 WHOLE: Final = "whole"  # name of the whole cycle among its stages
-EARLY: Final = 30.0  # how far before the start a loop may close (m), as the sensor sees ahead
 
 
 def stage_times(cycles: Sequence[CycleRecord]) -> list[dict[str, Any]]:
@@ -302,14 +301,17 @@ def _end_values(run: RunResult, log: Log) -> dict[str, float]:
 
 
 def closes_falsely(run: RunResult, truth: Truth) -> bool:
-    """Return whether the loop closed, a batch at its end, before the true drive was back at the start."""
+    """Return whether the loop closed, a batch at its end, before the true drive was back at the start.
+
+    It may close 30 m before, as the sensor sees ahead.
+    """
     if not run.map.closed:
         return False
     t, ends = closing_stamp(run), true_lap_ends(truth)
     if len(ends) == 0:
         return True
     driven = path_lengths(truth.poses)
-    return bool(np.interp(t, truth.pose_t, driven) < driven[ends[0]] - EARLY)
+    return bool(np.interp(t, truth.pose_t, driven) < driven[ends[0]] - 30.0)
 
 
 def closing_stamp(run: RunResult) -> float:

@@ -39,7 +39,7 @@ def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArr
     if truth.sensor is None and truth.bend is None:
         return log, associations
     yaw, lateral, latency, scale, bias = np.zeros(5) if truth.sensor is None else truth.sensor
-    bend = np.zeros(2) if truth.bend is None else truth.bend
+    k, begin = np.zeros(2) if truth.bend is None else truth.bend
     c, s = np.cos(yaw), np.sin(yaw)
     to_vehicle = np.array([[c, -s], [s, c]])
     parts = np.split(associations, np.cumsum([len(cycle.labels) for cycle in log.cycles])[:-1])
@@ -49,7 +49,10 @@ def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArr
             continue
         measured = cycle.points_vehicle
         distance, radial = _rays(measured)
-        ranges, slope = _true_ranges(distance - bias, float(scale), bend)
+        excess = distance - bias - (1.0 + scale) * begin
+        squared = (1.0 + scale) ** 2 + 4.0 * k * np.maximum(excess, 0.0)
+        slope = np.sqrt(np.maximum(squared, np.finfo(float).eps))  # of the measured range by the true one
+        ranges = begin + 2.0 * excess / (1.0 + scale + slope)
         across = ranges / distance
         change = to_vehicle @ (radial / slope[:, None, None] + across[:, None, None] * (np.eye(2) - radial))
         points = measured * across[:, None] @ to_vehicle.T + [0.0, lateral]
@@ -57,14 +60,6 @@ def without_sensor_errors(log: Log, associations: IntArray) -> tuple[Log, IntArr
         cycles.append(Detections(cycle.t - latency, points, covariances, cycle.labels))
         left.append(part)
     return replace(log, cycles=tuple(cycles)), np.concatenate([np.zeros(0, dtype=int), *left])
-
-
-def _true_ranges(measured: Array, scale: float, bend: Array) -> tuple[Array, Array]:
-    """Return r (m,) of `(1 + scale) r + k max(r - begin, 0)^2`, and the derivative of that at r (m,)."""
-    k, begin = bend
-    excess = measured - (1.0 + scale) * begin
-    slope = np.sqrt(np.maximum((1.0 + scale) ** 2 + 4.0 * k * np.maximum(excess, 0.0), np.finfo(float).eps))
-    return begin + 2.0 * excess / (1.0 + scale + slope), slope
 
 
 def with_true_covariances(log: Log) -> Log:

@@ -4,7 +4,7 @@ import platform
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
-from typing import Any, Final, TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -24,8 +24,6 @@ from .accuracy import LapMetrics, lap_metrics, root_mean_square, true_lap_ends
 from .consistency import consistency_at_cones
 from .trajectory import position_rms, trajectory_errors
 
-GATE: Final = ("dropped", "refused")  # counts of the gate in each cycle
-
 
 def summarize(result: RunResult, log: Log | None, hints: Sequence[Hint] = ()) -> dict[str, Any]:
     """Return the estimator, settings, versions, laps, timing, hints, and with truth the paper's metrics.
@@ -44,7 +42,10 @@ def summarize(result: RunResult, log: Log | None, hints: Sequence[Hint] = ()) ->
         "size": result.map.size,
         "not_mapped": not_mapped(result.map, log) if log is not None else [],
         "points": {NAMES[label]: own.size for label, own in sorted(result.map.points.items())},
-        "gate": {name: sum(getattr(record, name) for record in result.cycles) for name in GATE},
+        "gate": {
+            "dropped": sum(record.dropped for record in result.cycles),
+            "refused": sum(record.refused for record in result.cycles),
+        },
         **_cycles(result),
     }
     if crossed := crossings_of(result):

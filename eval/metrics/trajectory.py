@@ -17,11 +17,7 @@ from pathspace_graph.sim.track import arc_lengths
 
 from .accuracy import boundary_distances, root_mean_square, true_lap_ends
 
-LOST, DIVERGED = 5.0, 1.0  # position errors beyond which a vehicle is lost, or its estimate has diverged (m)
 MOST: Final = 35.0  # greatest length of a reach (m)
-ON_CURVE: Final = 0.5  # distance of a true cone from the mapped boundary at which the reach ends (m)
-SHORT: Final = 4.0  # reach below which no planner can work (m)
-STARTING: Final = 0.03  # share of lap 1 on which the map has only begun, and cycles don't count
 
 
 def interpolate_poses(pose_t: Array, poses: Array, t: Array) -> Array:
@@ -44,14 +40,14 @@ def trajectory_errors(t: Array, poses: Array, truth: Truth) -> Array:
 
 
 def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:
-    """Return the largest position error (m), its rms in the last second (m), and whether that is lost."""
+    """Return the largest position error (m), and whether its rms in the last second is over 5 m: lost."""
     errors = trajectory_errors(t, poses, truth)
     if len(errors) == 0:
         return {}
     known = t[(t >= truth.pose_t[0]) & (t <= truth.pose_t[-1])]
     largest = float(np.linalg.norm(errors[:, :2], axis=1).max())
     end = position_rms(errors[known >= known[-1] - 1.0])
-    return {"error_max": largest, "lost_at_end": end > LOST}
+    return {"error_max": largest, "lost_at_end": end > 5.0}
 
 
 def longest_divergence(t: Array, poses: Array, truth: Truth, since: float) -> dict[str, float]:
@@ -64,7 +60,7 @@ def longest_divergence(t: Array, poses: Array, truth: Truth, since: float) -> di
         return {}
     stamps, errors = t[after], np.linalg.norm(trajectory_errors(t[after], poses[after], truth)[:, :2], axis=1)
     driven = np.interp(stamps, truth.pose_t, path_lengths(truth.poses))
-    diverged = np.append(errors > DIVERGED, False).astype(int)
+    diverged = np.append(errors > 1.0, False).astype(int)
     begins = np.flatnonzero(np.diff(diverged, prepend=0) == 1)
     ends = np.minimum(np.flatnonzero(np.diff(diverged, prepend=0) == -1), len(stamps) - 1)
     time, way = (float((of[ends] - of[begins]).max(initial=0.0)) for of in (stamps, driven))
@@ -111,7 +107,8 @@ class ReachObserver:
         self._stations = stations[order]
         self._cones, self._labels = truth.cones[own][cone[order]], truth.cone_labels[own][cone[order]]
         lap, whole = (ends[0], np.inf) if len(ends) else (driven[-1], driven[-1] - MOST)
-        self._counted = float(STARTING * lap), float(whole)  # stations between which cycles count (m)
+        # stations between which cycles count (m): on the first 3 % of lap 1 the map has only begun
+        self._counted = float(0.03 * lap), float(whole)
         self._rows: list[tuple[float, float, int]] = []
 
     def __call__(self, cycle: ObservedCycle) -> None:
@@ -136,7 +133,8 @@ class ReachObserver:
         """Return the reach of a map at a true station (m), seen from the true and the estimated pose (3,).
 
         The cones are placed by `map_T_vehicle * vehicle_T_cones`, with the estimated and with the true pose,
-        so that only what the vehicle would see ahead of itself counts. The sum of their squared distances
+        so that only what the vehicle would see ahead of itself counts. The reach ends at a cone that is over
+        0.5 m from its mapped boundary. The sum of their squared distances
         (m^2) and their number are of the stretch in reach.
         """
         ahead = slice(*np.searchsorted(self._stations, [station, station + MOST]))
@@ -146,7 +144,7 @@ class ReachObserver:
         distances = np.full(len(points), np.inf)
         for label, boundary in track.boundaries.items():
             distances[labels == label] = _distances(boundary, points[labels == label])
-        reach = float(away[distances > ON_CURVE].min(initial=MOST))
+        reach = float(away[distances > 0.5].min(initial=MOST))
         on_stretch = distances[away < reach]
         return reach, float(on_stretch @ on_stretch), len(on_stretch)
 
@@ -181,5 +179,5 @@ def reach_values(rows: Array) -> dict[str, float]:
     reach, squares, cones = counted.T
     median, tenth = np.quantile(reach, [0.5, 0.1]).tolist()
     error = float(np.sqrt(squares.sum() / cones.sum())) if cones.sum() else float("nan")
-    short = float(np.mean(reach < SHORT))
+    short = float(np.mean(reach < 4.0))
     return {"reach_median": median, "reach_p10": tenth, "reach_short": short, "reach_error": error}

@@ -20,7 +20,7 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import CONDITIONS, LOST, Health
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import Truth
-from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
+from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BIG_ORANGE, NAMES
 from pathspace_graph.labels import ORANGE as ORANGE_CONE
 from pathspace_graph.run import ObservedCycle
@@ -173,7 +173,12 @@ class Recorder:
         replaced = cycle.result.jump is not None or cycle.result.closed != self._closed
         if cycle.number % BAND_EVERY == 0 or replaced:
             for label, boundary in cycle.map.boundaries.items():
-                self._lines(_path(label, "band"), self._band(boundary))
+                if isinstance(boundary, SplineBoundary):
+                    u = style.curve_parameters(boundary.spline, SAMPLES_PER_SPAN)
+                    band = [*style.uncertainty_band(boundary, u)]
+                else:
+                    band = [*style.ellipse_outlines(boundary.points, boundary.covariance)]
+                self._lines(_path(label, "band"), band)
         self._lines(VEHICLE, [to_map(OUTLINE, np.tile(pose, (len(OUTLINE), 1)))])
         before = pose if self._last_pose is None else self._last_pose
         self._lines(TRAJECTORY, [np.array([before[:2], pose[:2]])])
@@ -196,10 +201,11 @@ class Recorder:
     def _set_styles(self) -> None:
         rerun = self._rerun
         lines, points = rerun.LineStrips2D, rerun.Points2D
+        pale = {k: to_hex(0.5 + 0.5 * np.array(to_rgb(color))) for k, color in BOUNDARY_COLORS.items()}
         styles = [  # kind, entity, colour, radius and order of drawing
             *((lines, _path(k, "curve"), color, 1.5, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
             *((lines, _path(k, "tentative"), color, 1.0, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
-            *((lines, _path(k, "band"), _pale(color), 0.7, LOW) for k, color in BOUNDARY_COLORS.items()),
+            *((lines, _path(k, "band"), color, 0.7, LOW) for k, color in pale.items()),
             *((points, _path(k, "points"), color, 2.0, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
             (points, _path(ORANGE_CONE, "points"), RED, 2.0, MIDDLE),
             (points, _path(BIG_ORANGE, "points"), RED, 3.0, MIDDLE),
@@ -247,12 +253,6 @@ class Recorder:
             self._lines(_path(label, "tentative"), dashes(boundary.spline.evaluate(tentative)))
             self._points(_path(label, "points"), boundary.spline.distinct_control_points)
 
-    def _band(self, boundary: MapBoundary) -> list[Array]:
-        if isinstance(boundary, SplineBoundary):
-            u = style.curve_parameters(boundary.spline, SAMPLES_PER_SPAN)
-            return list(style.uncertainty_band(boundary, u))
-        return list(style.ellipse_outlines(boundary.points, boundary.covariance))
-
     def _show_messages(self, cycle: ObservedCycle) -> None:
         result, health, levels = cycle.result, cycle.result.health, self._rerun.TextLogLevel
         if health.condition and health.condition != self._last_health.condition:
@@ -280,11 +280,6 @@ def dashes(points: Array) -> list[Array]:
 
 def _path(label: int, part: str) -> str:
     return f"{MAP}/{NAMES[label]}/{part}"
-
-
-def _pale(color: str) -> str:
-    """Mix a colour "#rrggbb" with as much white."""
-    return str(to_hex(0.5 + 0.5 * np.array(to_rgb(color))))
 
 
 def _rgb(color: str) -> tuple[int, ...]:

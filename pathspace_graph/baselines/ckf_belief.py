@@ -45,20 +45,16 @@ def square_root(covariance: Array) -> Array:
     return np.asarray(np.linalg.qr((vectors * np.sqrt(lifted)).T)[1].T)
 
 
-def cubature_points(mean: Array, root: Array) -> Array:
-    """Cubature points `mean +- sqrt(d) L e_i` (2 d, d), the positive ones first, of weight 1 / (2 d) each."""
-    offsets = np.sqrt(len(mean)) * root.T
-    return np.concatenate([mean + offsets, mean - offsets])
-
-
 def transform(function: Callable[[Array], Array], mean: Array, covariance: Array) -> Transformed:
     """Compute mean, covariance and slope of `function`, which maps points (k, d) row by row to (k, q).
 
-    All are exact for a linear function; the mean is exact for a polynomial of the third degree.
+    Its 2 d points are `mean +- sqrt(d) L e_i`, of equal weight, where L is the root of the covariance. All
+    are exact for a linear function; the mean is exact for a polynomial of the third degree.
     """
     root = square_root(covariance)
     d = len(mean)
-    values = function(cubature_points(mean, root))
+    offsets = np.sqrt(d) * root.T
+    values = function(np.concatenate([mean + offsets, mean - offsets]))
     centre = values.mean(axis=0)
     spread = (values - centre) / np.sqrt(2.0 * d)
     half = (values[:d] - values[d:]) / (2.0 * np.sqrt(d))
@@ -165,12 +161,6 @@ class Belief:
         self.mean += half[:, :-1].T @ half[:, -1]
         self.covariance -= half[:, :-1].T @ half[:, :-1]
         self.covariance = 0.5 * (self.covariance + self.covariance.T)
-
-    def predict_detections(self, points: IntArray) -> Transformed:
-        """Predict corrected detections of points (k,), vehicle frame: mean (2k,) and covariance (2k, 2k)."""
-        columns = self.measuring_columns(point_columns(points))
-        covariance = self.covariance[np.ix_(columns, columns)]
-        return transform(self.measuring(points), self.mean[columns], covariance)
 
     def measuring_columns(self, others: IntArray) -> IntArray:
         """Entries of x that detections depend on: pose, sensor, and others (k,)."""

@@ -120,16 +120,12 @@ class CurveState:
         last = slice(n - p - 1, n)
         belief.transform_points(end - p - 1, end, matrix[last, last], np.zeros(p + 1))
         self._append_points(label, BSpline(knots, np.zeros((n + 1, 2)), p), 1)
-        self._limit_bending(label, p + 1)
-
-    def _limit_bending(self, label: int, count: int) -> None:
-        curve = self.curves[label]
-        last = np.arange(curve.size - count, curve.size)
-        abscissae = greville(curve.knots, curve.degree)[last]
-        matrix = np.kron(smoothness_matrix(abscissae, None), np.eye(POINT))
+        # a prior of little bending: else the uncertainty of the end grows with each extension
+        abscissae = greville(knots, p)[-p - 1 :]
+        bending = np.kron(smoothness_matrix(abscissae, None), np.eye(POINT))
         sigma = self.settings.ckf.sigma_bend * float(np.mean(np.diff(abscissae)))
-        noise = sigma**2 * np.eye(len(matrix))
-        self.belief.update(self.columns(label, last), lambda x: x @ matrix.T, np.zeros(len(matrix)), noise)
+        noise, columns = sigma**2 * np.eye(len(bending)), self.columns(label, np.arange(n - p, n + 1))
+        belief.update(columns, lambda x: x @ bending.T, np.zeros(len(bending)), noise)
 
     def _append_points(self, label: int, curve: BSpline, added: int) -> None:
         """Move the last `added` points of x to the end of a curve, which takes the knots of `curve`."""
@@ -154,7 +150,6 @@ class CurveState:
 
 LONGEST_EXTENSION: Final = 12.0  # largest length of one extension (m)
 SIGMA_CARRY: Final = 1.0  # standard deviation of the control point of an extrapolated end (m)
-END_TOLERANCE_U: Final = 1e-6  # tolerance of a foot point at the end of a curve (m)
 
 
 class Expansion:
@@ -214,15 +209,11 @@ class Expansion:
             return found.where(chain(found, None))
         end = _end(state, label, path_ahead)
         if len(found.points):
-            found = found.where(self._beyond(state, label, found, end))
+            high, low = state.curves[label].domain[1], state.visible_range(label, len(found.points))[0]
+            foot = state.foot_points(label, found.points, np.minimum(low, high), np.full(len(low), high))
+            beyond = beyond_end(found.points, foot.u, high, state.control_points(label))
+            found = found.where((found.stations > end.station + path.STATION_MARGIN) & beyond)
         return found.where(chain(found, end))
-
-    def _beyond(self, state: CurveState, label: int, found: Candidates, end: End) -> BoolArray:
-        high, control_points = state.curves[label].domain[1], state.control_points(label)
-        low, _ = state.visible_range(label, len(found.points))
-        foot = state.foot_points(label, found.points, np.minimum(low, high), np.full(len(low), high))
-        ahead = found.stations > end.station + path.STATION_MARGIN
-        return ahead & beyond_end(found.points, foot.u, high, control_points)
 
     def _extend(self, state: CurveState, label: int, detections: Detections, found: Candidates) -> bool:
         """Extend a curve to the last candidate of the proximity chain; return whether there is one."""
@@ -274,7 +265,7 @@ def beyond_end(
     The foot point is the end `high`, the distance from `C_n` exceeds the growth threshold, and the distance
     from `C_{n-1}` exceeds the separation.
     """
-    at_end = u >= high - END_TOLERANCE_U
+    at_end = u >= high - 1e-6  # of round-off (m)
     far = np.hypot(*(points - control_points[-1]).T) > threshold
     apart = np.hypot(*(points - control_points[-2]).T) > separation
     return np.asarray(at_end & far & apart)
@@ -298,10 +289,6 @@ def _end(state: CurveState, label: int, path_ahead: PathAhead) -> End:
 
 
 # --- the update ------------------------------------------------------------------------------------------
-
-
-GAIN_RANK: Final = 1e-9  # least singular value of the gain that is not zero, relative to the largest one
-LEAST_BASIS: Final = 1e-3  # least sum of a control point's basis values for its update
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,27 +362,19 @@ class SplineMeasurement:
     def range_basis(self) -> Array:
         """Orthonormal basis (r, q) of the range of G, which the detections can change."""
         vectors, values, _ = np.linalg.svd(self.gain, full_matrices=False)
-        return np.asarray(vectors[:, values > GAIN_RANK * values[0]])
-
-
-def regularization(basis: Array) -> Array:
-    """Regularization `L = lambda diag(1 - B' 1 / m)` (r, r) for a basis B (m, r)."""
-    return np.diag(RIDGE * (1.0 - basis.mean(axis=0)))
-
-
-def ridge_gain(basis: Array) -> Array:
-    """Gain `G = (B' B + L)^-1 B'` (r, m) of the ridge regression `C = C_mu + G (y - B C_mu)`."""
-    gram = basis.T @ basis + regularization(basis)
-    return np.asarray(np.linalg.lstsq(gram, basis.T, rcond=None)[0])
+        return np.asarray(vectors[:, values > 1e-9 * values[0]])
 
 
 def fit_detections(basis: Array, detections: Array, covariances: Array, known: Array) -> SplineMeasurement:
     """Fit S_z to detections (m, 2) with covariances (m, 2, 2), by a cubature transform of ridge regression.
 
-    basis (m, r) is evaluated at their foot points; known (r, 2) are the control points in their frame.
+    The basis B (m, r) is evaluated at their foot points; known (r, 2) are the control points C_mu in their
+    frame. The regression is `C = C_mu + G (y - B C_mu)` with the gain `G = (B' B + L)^-1 B'` and the
+    regularization `L = ridge diag(1 - B' 1 / m)`, which is less where detections act.
     """
     m, r = basis.shape
-    gain = ridge_gain(basis)
+    gram = basis.T @ basis + np.diag(RIDGE * (1.0 - basis.mean(axis=0)))
+    gain = np.asarray(np.linalg.lstsq(gram, basis.T, rcond=None)[0])
     joint = np.zeros((m, 2, m, 2))
     joint[np.arange(m), :, np.arange(m), :] = covariances
     kept = known - gain @ (basis @ known)
@@ -444,7 +423,7 @@ def _fit(state: CurveState, label: int, detections: Detections, on: OnCurve) -> 
 
     Their covariances are `K + sigma_model^2 I + sigma_along^2 t t'`, vehicle frame, with unit tangents t.
     """
-    control = np.flatnonzero(on.basis.sum(axis=0) > LEAST_BASIS)
+    control = np.flatnonzero(on.basis.sum(axis=0) > 1e-3)
     known = to_vehicle_rows(state.pose[None], state.control_points(label)[control].reshape(1, -1))
     points = detections.points_vehicle[on.rows]
     t = on.tangents @ rotation(state.pose[2])

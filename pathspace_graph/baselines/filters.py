@@ -28,20 +28,17 @@ from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline, sparse_rows
 from pathspace_graph.spline.knots import SAMPLED_WEIGHT, LeastSquares
 
-from .ckf_belief import HEAD, Belief, point_columns
-from .ckf_curves import CurveState, Expansion, OnCurve, classify, in_map, update
+from .ckf_belief import HEAD, Belief, point_columns, transform
+from .ckf_curves import CurveState, Expansion, classify, in_map, update
 from .landmark_association import ROUGH_GATE, assign, compatible, pair_costs
 from .landmark_map import UNASSOCIATED, landmark_counts, point_map
 from .online import FRONT_END, OnlineBaseline
 
-EXTRAPOLATED: Final = 2  # knot intervals past the confirmed end that map to the closed curve
 JOIN_MARGIN: Final = 10.0  # with `BEGINNING`, largest distance of the seam from the end of a curve (m)
 JOIN_SHARE: Final = 0.5  # least parameter of the seam on a short curve, as a share of its length
 OVERLAP_STEP: Final = 1.0  # step of the points of the overlap (m)
 OVERLAP_ROOM: Final = 4.0  # search range of their foot points on the beginning, about the expected ones (m)
-PERIODIC_STEP: Final = 0.1  # step of the points of an open curve that a closed one is fitted to (m)
 CURVATURE_MAX: Final = 0.7  # limit of the curvature (1/m), so that a kink does not attract all knots
-SAMPLES_PER_BREAK: Final = 40  # samples of the curvature for each break
 SIGMA_SIMPLIFY: Final = 0.1  # of a control point's move by simplification, a looser prior (m)
 LINEAR_BASELINE: Final = 0.5  # share of the knots that is spread evenly; the others follow the curvature
 SEAM_MARGIN: Final = 0.5  # distance before the seam within which a cone belongs to the beginning (m)
@@ -75,7 +72,7 @@ def make_periodic(
     size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
     breaks = curvature_weighted_breaks(spline, size, LINEAR_BASELINE, 0.0, period)
     frame = BSpline.periodic_from(breaks, np.zeros((len(breaks) - 1, 2)), boundary.degree)
-    u = np.linspace(*spline.domain, int(boundary.length / PERIODIC_STEP) + 1)
+    u = np.linspace(*spline.domain, int(boundary.length / 0.1) + 1)
     fit = LeastSquares(frame, overlap.new_parameter(u), SAMPLED_WEIGHT)
     change = fit.solve(sparse_rows(*spline.local_basis(u), spline.size))
     return overlap, frame.with_points(change @ control_points), change
@@ -88,7 +85,7 @@ def curvature_weighted_breaks(spline: BSpline, count: int, baseline: float, low:
     curve, with the linear baseline b. An open curve is straight beyond its ends.
     """
     first, last = spline.domain
-    u = np.linspace(low, high, SAMPLES_PER_BREAK * count + 1)
+    u = np.linspace(low, high, 40 * count + 1)
     middle, even = 0.5 * (u[1:] + u[:-1]), np.hypot(*np.diff(spline.evaluate(u), axis=0).T)
     bent = np.minimum(np.abs(spline.curvature(middle)), CURVATURE_MAX) * even
     if not spline.periodic:
@@ -128,20 +125,13 @@ def find_overlap(boundary: Boundary, control_points: Array) -> Overlap:
     low, high = np.maximum(u - seam - OVERLAP_ROOM, 0.0), u - seam + OVERLAP_ROOM
     w = boundary.find(control_points, boundary.evaluate(control_points, u), low, high).u
     w = np.maximum.accumulate(w)
-    w[0], beyond = 0.0, EXTRAPOLATED * boundary.nominal[0]
+    w[0], beyond = 0.0, 2.0 * boundary.nominal[0]  # two knot intervals past the end go on alike
     return Overlap(seam, np.append(u, u[-1] + beyond), np.append(w, w[-1] + beyond))
-
-
-# --- periodic knots --------------------------------------------------------------------------------------
-
-
-FILTER_REACH: Final = (
-    9.0  # largest distance ahead of the vehicle of a curve's end (m along the predicted path)
-)
 
 
 # --- the filters -----------------------------------------------------------------------------------------
 
+FILTER_REACH: Final = 9.0  # reach of a curve's end ahead of the vehicle (m along the predicted path)
 RECENT: Final = 2.0  # largest age of the detections that are laid on the early segment (s)
 SIGMA_TIE: Final = 0.15  # standard deviation of the distance between the ends of a curve at closure (m)
 SIGMA_ALONG: Final = 0.4  # standard deviation of the place on the early segment, along the curves (m)
@@ -182,7 +172,14 @@ class CkfMapper(_Filter):
         watch.lap("predict")
         found = classify(state, detections)
         watch.lap("classify")
-        found = self._expand(detections, found)
+        if not self.closed:
+            self.expansion.observe(state, detections)
+            free = np.ones(len(detections.labels), bool)
+            for on in found.values():
+                free[on.rows] = False
+            path_ahead = self.path.ahead(state.pose, FILTER_REACH)
+            if self.expansion.expand(state, detections, path_ahead, free):
+                found = classify(state, detections)
         watch.lap("expand")
         update(state, detections, found)
         watch.lap("update")
@@ -191,17 +188,6 @@ class CkfMapper(_Filter):
         left, right = (state.curves[label].size if label in state.curves else 0 for label in BOUNDARIES)
         used = sum(len(on.rows) for on in found.values())
         return CycleResult(detections.t, state.pose.copy(), (left, right), used, self.closed, watch.laps)
-
-    def _expand(self, detections: Detections, found: dict[int, OnCurve]) -> dict[int, OnCurve]:
-        if self.closed:
-            return found
-        self.expansion.observe(self.state, detections)
-        free = np.ones(len(detections.labels), bool)
-        for on in found.values():
-            free[on.rows] = False
-        path_ahead = self.path.ahead(self.state.pose, FILTER_REACH)
-        extended = self.expansion.expand(self.state, detections, path_ahead, free)
-        return classify(self.state, detections) if extended else found
 
     def _close(self, detections: Detections) -> None:
         """Search the early segment after the shortest lap; close and simplify both curves there."""
@@ -252,12 +238,18 @@ def update_by_correspondences(state: CurveState, motion: Array) -> bool:
     Along the tangent all k correspondences are one result of the registration, so each has sqrt(k) times its
     sigma. Return False, without an update, if an end has not reached its beginning yet.
     """
-    overlaps = {label: _overlap(state, label, motion) for label in state.curves}
-    if not all(len(u) for u, _ in overlaps.values()):
-        return False
     rows, columns = [], []
-    for label, (u, w) in overlaps.items():
+    for label in state.curves:
         spline = state.spline(label)
+        high = spline.domain[1]
+        u = np.arange(max(high - BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
+        zero = np.zeros(len(u))
+        moved = move_points(motion, spline.evaluate(u))
+        foot = state.foot_points(label, moved, zero, zero + beginning_of(high))
+        on = foot.interior & (np.abs(foot.distance) < TIE_REACH)
+        if not on.any():
+            return False
+        u, w = u[on], foot.u[on]
         basis = spline.basis_matrix(u) - spline.basis_matrix(w)
         tangents = spline.tangent_unit(w)
         normals = left_of(tangents)
@@ -270,19 +262,6 @@ def update_by_correspondences(state: CurveState, motion: Array) -> bool:
     measured, noise = np.zeros(len(matrix)), np.diag(sigma**2)
     state.belief.update(np.concatenate(columns), lambda x: x @ matrix.T, measured, noise)
     return True
-
-
-def _overlap(state: CurveState, label: int, motion: Array) -> tuple[Array, Array]:
-    """Return parameters (k,) near the end of a curve, and of their correspondences at the beginning (k,)."""
-    spline = state.spline(label)
-    high = spline.domain[1]
-    u = np.arange(max(high - BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
-    moved = move_points(motion, spline.evaluate(u))
-    zero = np.zeros(len(u))
-    beginning = beginning_of(high)
-    foot = state.foot_points(label, moved, zero, zero + beginning)
-    on = foot.interior & (np.abs(foot.distance) < TIE_REACH)
-    return u[on], foot.u[on]
 
 
 def simplify(state: CurveState, observed: Mapping[int, Mapping[int, Array]]) -> None:
@@ -336,7 +315,9 @@ class LandmarkCkf(_Filter):
         nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH_GATE)[1])
         predicted, covariances = np.zeros((0, POINT)), np.zeros((0, POINT, POINT))
         if (k := len(nearby)) > 0:
-            seen = self.belief.predict_detections(nearby)
+            columns, belief = self.belief.measuring_columns(point_columns(nearby)), self.belief
+            covariance = belief.covariance[np.ix_(columns, columns)]
+            seen = transform(belief.measuring(nearby), belief.mean[columns], covariance)
             predicted = seen.mean.reshape(k, POINT)
             covariances = seen.covariance.reshape(k, POINT, k, POINT)[np.arange(k), :, np.arange(k)]
         cost = pair_costs(detections.points_vehicle, detections.covariances, predicted, covariances)

@@ -19,10 +19,8 @@ from pathspace_graph.settings.online import GrowthSettings
 from .landmark_map import AMBIGUOUS, SIGMA_MERGE, UNASSOCIATED, LandmarkSmoother, LandmarkState, two_rows
 
 ROUGH_GATE: Final = 5.0  # largest distance of a tested landmark from a detection of the cycle (m)
-HELD_MARGIN: Final = 1e-9  # margin of a previous pair below the match gate, against round-off
-MATCH: Final = 0.95  # probability of the gate of a match
 CREATE: Final = 0.99  # probability of the gates outside of which a detection may be new
-MATCH_GATE: Final = chi2_quantile(MATCH, POINT)  # gate of a match (squared Mahalanobis distance)
+MATCH_GATE: Final = chi2_quantile(0.95, POINT)  # gate of a match (squared Mahalanobis distance)
 CREATE_GATE: Final = chi2_quantile(CREATE, POINT)  # gate outside of which a detection may be new
 
 
@@ -57,7 +55,7 @@ def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_co
 
 def hysteresis_costs(cost: Array, held: BoolArray) -> Array:
     """Keep previous (`held`) pairs in the match gate up to the create gate, so that they do not flip."""
-    inside = (1.0 - HELD_MARGIN) * MATCH_GATE
+    inside = (1.0 - 1e-9) * MATCH_GATE  # against round-off
     return np.where(held & (cost < CREATE_GATE), np.minimum(cost, inside), cost)
 
 
@@ -129,23 +127,27 @@ def associate_created(
 def find_duplicates(
     state: LandmarkState, known: int, covariance: Callable[[IntArray], Array], settings: MapperSettings
 ) -> tuple[IntArray, IntArray]:
-    """Find duplicates: the positions (k,) of landmarks, and of older landmarks of the same cone."""
-    newer, older = pairs_within(state.landmarks[:known], state.labels[:known], settings.growth.merge_radius)
+    """Find duplicates: the positions (k,) of landmarks, and of older landmarks of the same cone.
+
+    Of the pairs of one label in the merge radius and the match gate, the nearest ones are taken, each
+    landmark once.
+    """
+    points, labels = state.landmarks[:known], state.labels[:known]
+    distance = np.hypot(*np.moveaxis(points[:, None] - points[None], 2, 0))
+    near = (distance < settings.growth.merge_radius) & (labels[:, None] == labels[None])
+    newer, older = np.nonzero(np.tril(near, -1))
     involved, index = np.unique(np.concatenate([newer, older]), return_inverse=True)
     if len(involved) == 0:
         return newer, older
     spread = difference_covariances(covariance(state.keys[involved]), *index.reshape(2, -1))
-    offset = state.landmarks[newer] - state.landmarks[older]
-    same = compatible_pairs(newer, older, offset, spread)
-    return newer[same], older[same]
-
-
-def pairs_within(landmarks: Array, labels: IntArray, radius: float) -> tuple[IntArray, IntArray]:
-    """Indices (k,) of landmarks, and of older ones of the same label within `radius` (m)."""
-    offset = landmarks[:, None] - landmarks[None]
-    near = (np.hypot(offset[..., 0], offset[..., 1]) < radius) & (labels[:, None] == labels[None])
-    newer, older = np.nonzero(np.tril(near, -1))
-    return newer, older
+    squared = squared_mahalanobis(points[newer] - points[older], spread)
+    taken, chosen = set[int](), list[int]()
+    for row in np.argsort(squared)[: int((squared < MATCH_GATE).sum())].tolist():
+        pair = {int(newer[row]), int(older[row])}
+        if taken.isdisjoint(pair):
+            taken |= pair
+            chosen.append(row)
+    return newer[chosen], older[chosen]
 
 
 def difference_covariances(joint: Array, i: IntArray, j: IntArray) -> Array:
@@ -153,19 +155,6 @@ def difference_covariances(joint: Array, i: IntArray, j: IntArray) -> Array:
     blocks = joint.reshape(len(joint) // POINT, POINT, -1, POINT)
     spread = blocks[i, :, i] + blocks[j, :, j] - blocks[i, :, j] - blocks[j, :, i]
     return np.asarray(spread + SIGMA_MERGE**2 * np.eye(POINT))
-
-
-def compatible_pairs(newer: IntArray, older: IntArray, offset: Array, covariances: Array) -> IntArray:
-    """Select pairs (k,) in the match gate by index, nearest first, one for each landmark."""
-    distance = squared_mahalanobis(offset, covariances)
-    taken: set[int] = set()
-    chosen = []
-    for row in np.argsort(distance)[: int((distance < MATCH_GATE).sum())].tolist():
-        pair = {int(newer[row]), int(older[row])}
-        if taken.isdisjoint(pair):
-            taken |= pair
-            chosen.append(row)
-    return np.array(chosen, np.intp)
 
 
 def merge(smoother: LandmarkSmoother, gone: IntArray, kept: IntArray) -> None:

@@ -71,70 +71,68 @@ class LandmarkFixedLag(OnlineBaseline):
         self._last_check = 0.0
 
     def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
-        motion, detections = reading.motion, reading.detections
+        motion, detections, smoother = reading.motion, reading.detections, self.smoother
+        table, state = smoother.map.detections, smoother.map.state
         if not self.closed:
             self.record.measured(reading)
-        predict(self.smoother, self.path, motion, detections.t)
+        predict(smoother, self.path, motion, detections.t)
         watch.lap("predict")
-        new = self.smoother.map.add(detections, self.smoother.next_cycle - 1, motion.odometry.twist)
-        self._use(new, detections.t, watch)
+        new = smoother.map.add(detections, smoother.next_cycle - 1, motion.odometry.twist)
+        eligible = np.ones(len(state), bool)
+        if not self.closed and self._near_start():  # a single detection of an old landmark is ambiguous
+            eligible = ~self._old()
+        association.associate_newest(smoother, new, eligible)
+        watch.lap("associate")
+        created = self._create(new, detections.t)
+        watch.lap("create")
+        for _ in range(self.settings.steps_grown if created else self.settings.steps):
+            smoother.step()
         if not self.closed:
             self.inflated = motions.inflate_priors(
-                self.smoother, self.inflated, reading.sensor_doubted, reading.measured
+                smoother, self.inflated, reading.sensor_doubted, reading.measured
             )
         watch.lap("update")
         self._close(reading)
         watch.lap("close")
-        self._marginalize()
-        watch.lap("marginalize")
-        return self._result(detections.t, watch.laps)
-
-    def _marginalize(self) -> None:
-        smoother, table = self.smoother, self.smoother.map.detections
         first, poses = smoother.first_cycle, smoother.variables.poses
         cycle, landmark = table.cycle, table.landmark
         smoother.marginalize()
         left = smoother.first_cycle - first
         if left:
             self._left.append((poses[:left].copy(), landmark[cycle < smoother.first_cycle].copy()))
-
-    def _use(self, new: slice, t: float, watch: Stopwatch) -> None:
-        eligible = np.ones(len(self.smoother.map.state), bool)
-        if not self.closed and self._near_start():  # a single detection of an old landmark is ambiguous
-            eligible = ~self._old()
-        association.associate_newest(self.smoother, new, eligible)
-        watch.lap("associate")
-        created = self._create(new, t)
-        watch.lap("create")
-        for _ in range(self.settings.steps_grown if created else self.settings.steps):
-            self.smoother.step()
+        watch.lap("marginalize")
+        used = int((table.used & (table.cycle == smoother.next_cycle - 1)).sum())
+        pose, sizes = smoother.variables.poses[-1].copy(), landmark_counts(state.labels)
+        return CycleResult(detections.t, pose, sizes, used, self.closed, watch.laps)
 
     def _create(self, new: slice, t: float) -> bool:
-        detections, created = self.smoother.map.detections, False
+        """Add landmarks at confirmed tracks; they get the detections of the window that created them."""
+        detections, state, variables = (
+            self.smoother.map.detections,
+            self.smoother.map.state,
+            self.smoother.variables,
+        )
+        created, tentative, growth = False, self.tentative, self.settings.growth
         rows = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
-        variables, tentative = self.smoother.variables, self.tentative
-        points = detections.points_map(rows, variables)
         covariances = detections.covariances_map(rows, variables)
-        tentative.add(points, covariances, detections.label[rows], t)
+        tentative.add(detections.points_map(rows, variables), covariances, detections.label[rows], t)
         for label in BOUNDARIES:
-            confirmed = tentative.confirmed(label, self.settings.growth.sightings)
-            if len(confirmed):
-                self._add_landmarks(label, tentative.points[confirmed].copy())
-                tentative.remove(confirmed)
-                created = True
+            confirmed = tentative.confirmed(label, growth.sightings)
+            if len(confirmed) == 0:
+                continue
+            points = tentative.points[confirmed].copy()
+            rows = np.flatnonzero((detections.label == label) & (detections.landmark == UNASSOCIATED))
+            points_map = detections.points_map(rows, variables)
+            chosen, landmark = association.associate_created(
+                points_map, detections.cycle[rows], points, growth
+            )
+            held, landmark = np.unique(landmark, return_inverse=True)
+            numbers = state.add(points[held], np.full(len(held), label, np.intp))[landmark]
+            detections.take(rows[chosen], numbers)
+            state.vote(detections.label[rows[chosen]], numbers)
+            tentative.remove(confirmed)
+            created = True
         return created
-
-    def _add_landmarks(self, label: int, points: Array) -> None:
-        """Add landmarks at points (k, 2), and associate the detections of the window that created them."""
-        detections, state = self.smoother.map.detections, self.smoother.map.state
-        rows = np.flatnonzero((detections.label == label) & (detections.landmark == UNASSOCIATED))
-        cycles = detections.cycle[rows]
-        points_map = detections.points_map(rows, self.smoother.variables)
-        chosen, landmark = association.associate_created(points_map, cycles, points, self.settings.growth)
-        held, landmark = np.unique(landmark, return_inverse=True)
-        numbers = state.add(points[held], np.full(len(held), label, np.intp))[landmark]
-        detections.take(rows[chosen], numbers)
-        state.vote(detections.label[rows[chosen]], numbers)
 
     def _near_start(self) -> bool:
         return self.path.near_beginning(self.smoother.variables.poses[-1], self.settings.closing)
@@ -204,11 +202,6 @@ class LandmarkFixedLag(OnlineBaseline):
             numbers = self.smoother.map.state.numbers
             np.maximum.at(self._last_detected, numbers[kept], self._last_detected[numbers[gone]])
             association.merge(self.smoother, gone, kept)
-
-    def _result(self, t: float, stages: dict[str, float]) -> CycleResult:
-        detections, sizes = self.smoother.map.detections, landmark_counts(self.smoother.map.state.labels)
-        used = int((detections.used & (detections.cycle == self.smoother.next_cycle - 1)).sum())
-        return CycleResult(t, self.smoother.variables.poses[-1].copy(), sizes, used, self.closed, stages)
 
     def _map(self, with_covariance: bool) -> Map:
         state = self.smoother.map.state

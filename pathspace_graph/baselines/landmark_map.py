@@ -245,10 +245,6 @@ def point_map(points: Array, labels: IntArray, joint: Array | None, closed: bool
 # --- the least-squares problem of a whole drive ----------------------------------------------------------
 
 
-MAX_STEPS: Final = 80  # largest number of steps
-GAIN_TOLERANCE: Final = 1e-6  # largest relative gain of the last step
-
-
 @dataclass(frozen=True, eq=False)
 class LandmarkSystem:
     """Minimizes `1/2 |odometry|^2 + sum rho(associated detections) + 1/2 |calibration, first pose|^2`."""
@@ -291,7 +287,7 @@ class LandmarkSystem:
             np.zeros(len(keys)),
             -1 - np.arange(len(keys)) // POINT,
         )
-        for _ in range(MAX_STEPS):
+        for _ in range(80):
             damped = replace(still, jacobian=np.sqrt(damping.weight) * still.jacobian)
             rows, before = self.rows(state, self.settings.gate.huber), variables.values
             variables.values = before + solution(linear_graph([*rows, damped], variables), variables.layout)
@@ -302,7 +298,7 @@ class LandmarkSystem:
             else:
                 cost -= gain
                 damping.lower()
-            if damping.exhausted or 0.0 <= gain <= GAIN_TOLERANCE * cost:
+            if damping.exhausted or 0.0 <= gain <= 1e-6 * cost:
                 break
         self.detections.correct(variables.sensor)
 

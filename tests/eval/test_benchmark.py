@@ -28,7 +28,6 @@ from pathspace_graph.eval.benchmark import (
     ROAD_WIDTH,
     SPEED,
     ToldLandmarks,
-    chosen,
     closed_road,
     measure_scaling,
     open_road,
@@ -72,8 +71,16 @@ def test_roads_have_their_gaps_and_width_and_never_come_near_themselves(track: A
     assert np.all(np.minimum(apart, len(track.left) - apart if track.closed else apart) < 6)
 
 
-def test_the_long_drive_ends_when_the_last_cone_is_seen() -> None:
+def test_the_long_drive_ends_when_the_last_cone_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is detected of no cone does not count."""
+    drives = list[Log]()
+    monkeypatch.setattr(benchmark, "simulate", lambda *given: drives.append(simulate(*given)) or drives[-1])
     ((log, at),) = sweep_drives(CONES, SMALL)
+    truth, detected = drives[0].truth, np.cumsum([len(cycle.labels) for cycle in log.cycles])
+    assert truth is not None and truth.associations is not None
+    cones = [{*truth.associations[:count].tolist()} for count in detected[-2:]]
+    assert -1 in cones[-1]
+    assert len(cones[0] - {-1}) < SMALL.cones_max <= len(cones[1] - {-1})
     ((whole, _),) = sweep_drives(CONES, ScalingSettings(cones_max=100.0, bins=1))
     assert len(at) == len(log.cycles) == len(whole.cycles)
     middles = 50.0 * (101.0 / 50.0) ** ((np.arange(4) + 0.5) / 4)  # of four intervals from 50 to 101 cones
@@ -90,12 +97,6 @@ def test_updates_have_as_many_detections_and_laps_as_they_say() -> None:
     assert {*at[~np.isnan(at)]} == {1.0, 2.0}
     ((log, at),) = sweep_drives(DENSE_LINE, SMALL)
     assert np.mean([len(cycle.labels) for cycle in log.cycles]) == pytest.approx(LINE_POINTS, rel=0.1)
-
-
-def test_detections_are_chosen_by_the_seed() -> None:
-    first, again = (chosen(20, 4, np.random.default_rng(0)) for _ in range(2))
-    assert first.sum() == 4 and (first == again).all()
-    assert chosen(3, 4, np.random.default_rng(0)).all()
 
 
 class Pretender:

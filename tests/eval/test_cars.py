@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial import KDTree
 
 from pathspace_graph.eval.cars import (
     OTHER,
@@ -52,10 +53,12 @@ def test_a_drive_that_begins_later_has_what_came_then_and_no_truth() -> None:
 def test_of_a_surveyed_map_some_neighbours_on_the_left_stood_elsewhere() -> None:
     truth, track = truth_of(LOG), to_map_frame(pear_track())
     curves = surveyed(truth, np.random.default_rng(1), moved=7).splines
-    off = {
-        label: np.abs(curves[label].foot_points(cones).distance)
-        for label, cones in ((LEFT, track.left), (RIGHT, track.right))
+    feet = {
+        label: curves[label].foot_points(cones) for label, cones in ((LEFT, track.left), (RIGHT, track.right))
     }
+    off, right = {label: np.abs(foot.distance) for label, foot in feet.items()}, KDTree(track.right)
+    moved = off[LEFT] > 1.0
+    assert (right.query(feet[LEFT].position[moved])[0] > right.query(track.left[moved])[0]).all(), "outwards"
     assert 4 <= (off[LEFT] > 1.0).sum() <= 9
     assert off[LEFT].max() < 3.5
     assert off[RIGHT].max() < 0.6
@@ -118,7 +121,7 @@ def test_there_is_a_row_for_each_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of four drives there are four maps of one, two of two, and one of all."""
     monkeypatch.setattr("pathspace_graph.eval.cars.metrics_of_group", lambda logs, _: {"logs": [*logs]})
     monkeypatch.setattr("pathspace_graph.eval.cars.solve_alone", lambda log: log)
-    monkeypatch.setattr("pathspace_graph.eval.cars.drive", lambda car, track, seed: seed)
+    monkeypatch.setattr("pathspace_graph.eval.cars.simulated", lambda car, track, seed: seed)
     rows = joint_of_track("plain", 4, 4)
     assert [row["drives"] for row in rows] == [1, 1, 1, 1, 2, 2, 4]
     assert [row["logs"] for row in rows[4:]] == [["0", "1"], ["2", "3"], ["0", "1", "2", "3"]]

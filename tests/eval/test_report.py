@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,8 @@ import pytest
 
 from pathspace_graph.cli import main
 from pathspace_graph.eval import report
-from pathspace_graph.eval.experiment.faults import at_strength, fault_table, outcomes, suite
 from pathspace_graph.eval.experiment.study import Study
-from pathspace_graph.eval.experiment.tables import Table, by_name, contrast_table, last_laps
+from pathspace_graph.eval.experiment.tables import TextTable, by_name, contrast_table, last_laps
 from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.eval.report import (
     estimators_table,
@@ -41,12 +39,12 @@ STUDY = Study(tracks=(0,), laps=3, estimators=("fixed-lag", "spline"))
 BOTH = pd.concat([frame("fixed-lag", 3, 0.6), frame("spline", 3, 0.3)], ignore_index=True)
 
 
-def values(table: Table, row: int) -> list[float | None]:
+def values(table: TextTable, row: int) -> list[float | None]:
     cells = table.frame.iloc[row, 1:]
     return [None if cell == "–" else float(cell.partition(" ± ")[0]) for cell in cells]
 
 
-def labels(table: Table) -> list[object]:
+def labels(table: TextTable) -> list[object]:
     return [*table.frame.iloc[:, 0]]
 
 
@@ -102,24 +100,8 @@ def test_a_table_of_runs_has_a_row_for_each_noise_and_estimator() -> None:
     assert values(found, 3) == [pytest.approx(0.1), None]
 
 
-def test_the_table_of_faults_is_relative_to_the_clean_run_of_the_middle_strength() -> None:
-    study = at_strength(suite(), 0.5)
-    late = "latency of detections: 50 ms"
-    runs = [
-        frame("fixed-lag", 2, rmse).assign(
-            noise=noise, size=50.0, closed_at_end=True, lost_at_end=False, notices=said, error_max=2.0
-        )
-        for noise, rmse, said in (("clean", 0.2, ""), (late, 0.3, "late"))
-    ]
-    pair = replace(study, noise={noise: study.noise[noise] for noise in ("clean", late)})
-    found = fault_table(pair, outcomes(pair, pd.concat(runs, ignore_index=True)))
-    assert labels(found) == ["clean", late]
-    assert [row["rmse by clean"] for row in found.records()] == ["1.00", "1.50"]
-    assert values(found, 1)[[*found.frame].index("reported [%]") - 1] == 100.0
-
-
 def test_a_tidy_table_has_a_row_for_each_figure() -> None:
-    table = Table.of(("metric", "lap 1", "batch"), [("rmse [m]", "0.50 ± 0.10", "–")])
+    table = TextTable.of(("metric", "lap 1", "batch"), [("rmse [m]", "0.50 ± 0.10", "–")])
     assert table.tidy.to_dict("records") == [
         {"metric": "rmse [m]", "column": "lap 1", "value": "0.50", "half_width": "0.10"},
         {"metric": "rmse [m]", "column": "batch", "value": "", "half_width": ""},

@@ -20,9 +20,6 @@ from pathspace_graph.sim.vehicle import VehicleSettings
 
 from ..scenes.drives import bean_track
 
-QUIET = OdometryNoise(white=(1e-9, 1e-9, 1e-9), scale=0.0, gyro_bias=0.0)
-
-
 # --- single errors ---------------------------------------------------------------------------------------
 
 
@@ -46,26 +43,6 @@ def test_a_bend_by_which_farther_cones_would_read_nearer_is_refused() -> None:
         SensorSettings(range_max=29.0, range_bend=-0.0251, range_bend_from=9.0)
     with pytest.raises(SettingsError, match=r"sensor\.range_bend_from: expected a number of at least 0"):
         SensorSettings(range_bend_from=-1.0)
-
-
-@cache
-def stopping(false_travel: float) -> Log:
-    """One lap, after which the vehicle stands for 6 s and its odometry goes on for 3 s."""
-    faults = Faults(odometry=OdometryFaults(false_travel=false_travel, false_travel_time=3.0))
-    vehicle = VehicleSettings(stand=6.0)
-    return simulate(bean_track(), SimulationSettings(1, vehicle, odometry=QUIET, faults=faults), 0)
-
-
-@pytest.mark.parametrize("false_travel", [0.0, 1.3])
-def test_the_vehicle_brakes_and_stands_at_the_end(false_travel: float) -> None:
-    truth = stopping(false_travel).truth
-    assert truth is not None
-    last = truth.pose_t[-1]
-    standing = truth.poses[truth.pose_t >= last - 5.9]
-    np.testing.assert_allclose(standing, standing[-1:].repeat(len(standing), axis=0), atol=1e-9)
-    at = [np.searchsorted(truth.pose_t, t) for t in np.arange(last - 8.0, last - 6.0, 0.2)]
-    speeds = np.linalg.norm(np.diff(truth.poses[at, :2], axis=0), axis=1) / 0.2
-    assert speeds[0] > 3.0 and np.diff(speeds).min() > -0.2 * 4.0 - 0.05  # the greatest deceleration
 
 
 def test_false_travel_needs_a_vehicle_that_stands() -> None:

@@ -16,7 +16,7 @@ from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, Veh
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track
-from pathspace_graph.sim.vehicle import Drive, VehicleSettings
+from pathspace_graph.sim.vehicle import Trajectory, VehicleSettings
 
 from ..scenes.drives import bean_track
 
@@ -205,7 +205,7 @@ def test_a_fault_scales_what_the_wheels_turn_and_not_the_drawn_errors() -> None:
     """`wheels (1 + drawn + fault)`: the product of both scales is in no reading."""
     t = 0.02 * np.arange(50)
     twists = np.column_stack([5.0 + np.sin(t), 0.1 * np.cos(t), 0.3 * np.sin(2.0 * t)])
-    driven, rng = Drive(t, np.zeros((50, 3)), twists), np.random.default_rng(1)
+    driven, rng = Trajectory(t, np.zeros((50, 3)), twists), np.random.default_rng(1)
     noise = OdometryNoise(white=(1e-12, 1e-12, 1e-12), scale=0.1, gyro_bias=0.0)
     found, calibration = measure_odometry(driven, 1.0, noise, OdometryFaults(speed_scale=0.05), rng)
     assert abs(calibration[0] - 0.05) > 0.01
@@ -264,7 +264,7 @@ def test_a_slow_start_is_missed_only_after_a_standstill() -> None:
     for first in (0.4, 0.0):
         twists = np.array([first, 0.5, 0.8, 1.2, 0.7, 0.6])[:, None] * [1.0, 0.0, 0.0]
         noise = OdometryNoise(white=(1e-12, 1e-12, 1e-12), scale=0.0, gyro_bias=0.0)
-        driven, rng = Drive(t, np.zeros((6, 3)), twists), np.random.default_rng(1)
+        driven, rng = Trajectory(t, np.zeros((6, 3)), twists), np.random.default_rng(1)
         found, _ = measure_odometry(driven, 1.0, noise, OdometryFaults(dead_band=1.0), rng)
         missed = [0.0] * 3 + [1.2, 0.7, 0.6] if first == 0.0 else twists[:, 0]
         np.testing.assert_allclose(found.twist[:, 0], missed, atol=1e-9)
@@ -275,7 +275,7 @@ def test_false_travel_goes_on_for_its_time_while_the_vehicle_stands() -> None:
     twists = np.array([2.0, 1.0, 0.3, 0.0, 0.0, 0.0, 0.0])[:, None] * [1.0, 0.0, 0.0]
     noise = OdometryNoise(white=(1e-12, 1e-12, 1e-12), scale=0.0, gyro_bias=0.0)
     faults, rng = OdometryFaults(false_travel=0.5, false_travel_time=0.04), np.random.default_rng(1)
-    found, _ = measure_odometry(Drive(t, np.zeros((7, 3)), twists), 1.0, noise, faults, rng)
+    found, _ = measure_odometry(Trajectory(t, np.zeros((7, 3)), twists), 1.0, noise, faults, rng)
     np.testing.assert_allclose(found.twist[:, 0], [2.0, 1.0, 0.5, 0.5, 0.5, 0.0, 0.0], atol=1e-9)
 
 

@@ -18,7 +18,6 @@ from pathspace_graph.sim.sensor import (
     ConeSensor,
     OdometryNoise,
     SensorSettings,
-    gauss_markov,
     measure_twists,
 )
 from pathspace_graph.sim.simulate import CAMERA, INS, SimulationSettings, simulate
@@ -205,11 +204,6 @@ def test_bad_settings(track: Track) -> None:
         simulate(track, SimulationSettings(), -1)
 
 
-def test_a_slow_error_has_its_size_from_the_first_reading_on() -> None:
-    drawn = gauss_markov((50, 20_000), 0.02, np.random.default_rng(0))
-    np.testing.assert_allclose(drawn[[0, 1, 10, 49]].std(axis=1), 1.0, rtol=0.03)
-
-
 # --- a camera's errors, and presets ----------------------------------------------------------------------
 
 
@@ -313,6 +307,11 @@ def test_the_slow_errors_of_the_odometry_have_their_size_and_time_and_shift_no_d
     measured, _ = measure_twists(twists, dt, slow, np.random.default_rng(0))
     errors = (measured - plain) / slow.slow
     np.testing.assert_allclose(errors.std(axis=0), 1.0, rtol=0.06)
+    starts = np.random.default_rng(1)
+    begins = [measure_twists(twists[:1], dt, slow, starts)[0] / slow.slow for _ in range(2000)]
+    np.testing.assert_allclose(
+        np.std(begins, axis=0)[0], np.hypot(1.0, np.divide(noise.white, slow.slow)), rtol=0.06
+    )
     for lag in (1, 40, 80):
         expected = np.exp(-lag * dt / 2.0)
         np.testing.assert_allclose((errors[lag:] * errors[:-lag]).mean(axis=0), expected, atol=0.08)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.sim.track import Track, along_path, to_map_frame
+from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_files import driving_order, read_track
 from pathspace_graph.sim.track_generator import generate_track
 
@@ -366,6 +366,7 @@ def test_a_start_is_on_the_leg_that_leads_its_way() -> None:
     turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 13)[1:-1]
     bend = np.column_stack([40.0 + 2.0 * np.cos(turn), 2.0 + 2.0 * np.sin(turn)])
     there, back = np.column_stack([x, 0.0 * x]), np.column_stack([x[::-1], 0.0 * x + 4.0])
-    line = along_path(np.concatenate([there, bend, back]), there, closed=False)
+    path, start = np.concatenate([there, bend, back]), np.zeros(3)
+    line = Track(there, back, np.zeros((0, 2)), False, start, "hairpin", path=path).centre_line
     assert line.nearest(np.array([20.0, 2.6, 0.0])) == pytest.approx(20.0, abs=0.3)
     assert line.nearest(np.array([20.0, 1.4, np.pi])) == pytest.approx(line.length - 20.0, abs=0.3)

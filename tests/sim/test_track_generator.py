@@ -120,13 +120,6 @@ def test_start_is_on_the_middle_of_a_straight(tracks: list[Track]) -> None:
         assert tangent @ [np.cos(track.start[2]), np.sin(track.start[2])] > np.cos(0.05)
 
 
-def test_a_seed_gives_the_same_track_and_another_another() -> None:
-    one, same, other = (generate_track(np.random.default_rng(seed)) for seed in (3, 3, 4))
-    assert one.left.tobytes() == same.left.tobytes()
-    assert one.right.tobytes() == same.right.tobytes()
-    assert one.left.tobytes() != other.left.tobytes()
-
-
 @pytest.mark.parametrize("cones", [120, 300, 500])
 def test_number_of_cones_can_be_set(cones: int) -> None:
     settings = TrackGeneratorSettings(cones=cones, lap_length=(220.0, 260.0))

@@ -13,7 +13,7 @@ from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.laps import lap_end_indices
 from pathspace_graph.sim.track import SmoothCurve, Track, to_map_frame
 from pathspace_graph.sim.track_generator import generate_track
-from pathspace_graph.sim.vehicle import Drive, VehicleSettings, _settling, _wander, drive, integrate
+from pathspace_graph.sim.vehicle import Trajectory, VehicleSettings, _settling, _wander, drive, integrate
 
 
 def generated(seed: int) -> Track:
@@ -27,7 +27,7 @@ def straight_track() -> Track:
 
 
 @pytest.fixture(scope="module")
-def driven() -> tuple[Track, Drive]:
+def driven() -> tuple[Track, Trajectory]:
     track = generated(1)
     return track, drive(track, 2, VehicleSettings(), np.random.default_rng(0))
 
@@ -49,7 +49,7 @@ def test_integration_is_the_exponential_map() -> None:
         np.testing.assert_allclose([np.cos(found[2]), np.sin(found[2])], pose[:2, 0], atol=1e-12)
 
 
-def test_twists_integrate_to_the_poses(driven: tuple[Track, Drive]) -> None:
+def test_twists_integrate_to_the_poses(driven: tuple[Track, Trajectory]) -> None:
     _, d = driven
     pose = np.eye(3)
     steps = np.diff(d.t)
@@ -60,14 +60,14 @@ def test_twists_integrate_to_the_poses(driven: tuple[Track, Drive]) -> None:
     np.testing.assert_allclose(pose[:2, 2], d.poses[-1, :2], atol=1e-6)
 
 
-def test_starts_at_the_origin_at_a_standstill(driven: tuple[Track, Drive]) -> None:
+def test_starts_at_the_origin_at_a_standstill(driven: tuple[Track, Trajectory]) -> None:
     _, d = driven
     np.testing.assert_array_equal(d.poses[0], np.zeros(3))
     assert np.hypot(*d.twists[0, :2]) < 0.2
     np.testing.assert_allclose(np.diff(d.t), 0.02)
 
 
-def test_speed_and_acceleration_limits(driven: tuple[Track, Drive]) -> None:
+def test_speed_and_acceleration_limits(driven: tuple[Track, Trajectory]) -> None:
     _, d = driven
     speed = np.hypot(d.twists[:, 0], d.twists[:, 1])
     assert 8.0 < speed.max() <= 12.0 * 1.01
@@ -91,7 +91,7 @@ def test_stays_between_the_cones_and_wanders(seed: int) -> None:
     assert offset.max() < 0.5
 
 
-def test_drives_its_laps_and_a_little_more(driven: tuple[Track, Drive]) -> None:
+def test_drives_its_laps_and_a_little_more(driven: tuple[Track, Trajectory]) -> None:
     track, d = driven
     path_ahead = np.linalg.norm(np.diff(d.poses[:, :2], axis=0), axis=1).sum()
     assert path_ahead == pytest.approx(2 * track.centre_line.length + 10.0, rel=0.01)

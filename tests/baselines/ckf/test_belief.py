@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-from numpy.typing import NDArray
 
-from pathspace_graph.baselines.ckf_belief import HEAD, Belief, point_columns, to_map_rows, to_vehicle_rows
+from pathspace_graph.baselines.ckf_belief import HEAD, Belief, point_columns, to_map_rows
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
 from pathspace_graph.factors.se2 import compose
-
-Array = NDArray[np.float64]
 
 
 def belief_with_points(seed: int = 0) -> Belief:
@@ -50,12 +46,6 @@ def test_new_points_have_the_uncertainty_of_pose_and_detection() -> None:
     np.testing.assert_allclose(uncalibrated, np.cov(np.hstack([poses, placed]).T), atol=2e-3)
 
 
-def test_the_views_of_map_and_vehicle_are_inverse() -> None:
-    rng = np.random.default_rng(3)
-    poses, points = rng.normal(size=(6, 3)), rng.normal(size=(6, 8))
-    np.testing.assert_allclose(to_vehicle_rows(poses, to_map_rows(poses, points)), points, atol=1e-12)
-
-
 def test_a_linear_update_is_the_kalman_filter() -> None:
     """The covariance is P - P H' (H P H' + R)^-1 H P."""
     belief, rng = belief_with_points(), np.random.default_rng(4)
@@ -88,14 +78,3 @@ def test_reordering_keeps_each_point_with_its_covariance() -> None:
     assert belief.points.shape == (2, 2)
     np.testing.assert_array_equal(belief.points[0], point)
     np.testing.assert_array_equal(belief.covariance[HEAD : HEAD + 2, :3], block)
-
-
-def test_detections_of_known_points_fix_the_pose() -> None:
-    belief = Belief(np.array([0.3, -0.2, 0.01]), np.diag([0.5, 0.5, 0.02]) ** 2)
-    known = np.array([[10.0, 2.0], [9.0, -2.0]])
-    belief.mean = np.concatenate([belief.mean, known.ravel()])
-    belief.covariance = np.pad(belief.covariance, (0, 4)) + 1e-8 * np.eye(HEAD + 4)
-    columns = np.concatenate([np.arange(3), point_columns(np.arange(2))])
-    for _ in range(3):
-        belief.update(columns, lambda x: to_vehicle_rows(x[:, :3], x[:, 3:]), known.ravel(), 1e-6 * np.eye(4))
-    assert np.abs(belief.pose) == pytest.approx(0.0, abs=5e-3)

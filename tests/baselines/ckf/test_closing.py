@@ -7,7 +7,13 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.baselines.ckf_curves import CurveState
-from pathspace_graph.baselines.filters import associate_early_segment, simplify, update_by_correspondences
+from pathspace_graph.baselines.filters import (
+    SIGMA_ALONG,
+    SIGMA_TIE,
+    associate_early_segment,
+    simplify,
+    update_by_correspondences,
+)
 from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.io.log import Detections
 
@@ -76,6 +82,17 @@ def test_the_correspondences_lay_the_end_on_the_beginning() -> None:
         assert np.abs(on_beginning.distance).max() < 0.1
     assert np.trace(state.belief.covariance) < spread
     assert np.linalg.eigvalsh(state.belief.covariance)[0] > -1e-9
+
+
+def test_along_a_curve_all_correspondences_are_one_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are one result of the registration: together they tell as much of the place as one alone."""
+    state, noises = drifted(), list[Array]()
+    monkeypatch.setattr(state.belief, "update", lambda *given: noises.append(np.diag(given[-1])))
+    assert update_by_correspondences(state, np.append(-SHIFT, 0.0))
+    (variances,) = noises
+    along = variances[variances > 1.01 * SIGMA_TIE**2]
+    assert len(along) == len(variances) / 2
+    assert np.sum(1.0 / along) == pytest.approx(len(state.curves) / SIGMA_ALONG**2)
 
 
 def test_closing_waits_until_the_end_has_reached_its_beginning() -> None:

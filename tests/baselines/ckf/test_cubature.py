@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.ckf_belief import cubature_points, square_root, transform
+from pathspace_graph.baselines.ckf_belief import square_root, transform
 
 Array = NDArray[np.float64]
 
@@ -14,15 +14,6 @@ Array = NDArray[np.float64]
 def random_covariance(rng: np.random.Generator, size: int) -> Array:
     root = rng.normal(size=(size, size))
     return root @ root.T + 0.1 * np.eye(size)
-
-
-def test_cubature_points_have_the_given_mean_and_covariance() -> None:
-    rng = np.random.default_rng(0)
-    mean, covariance = rng.normal(size=5), random_covariance(rng, 5)
-    points = cubature_points(mean, square_root(covariance))
-    assert points.shape == (10, 5)
-    np.testing.assert_allclose(points.mean(axis=0), mean, atol=1e-12)
-    np.testing.assert_allclose((points - mean).T @ (points - mean) / 10, covariance, atol=1e-12)
 
 
 def test_a_linear_function_is_transformed_exactly() -> None:
@@ -44,12 +35,6 @@ def test_the_slope_gives_the_covariance_with_correlated_variables() -> None:
     """Cov(f(x), y) of jointly Gaussian x, y is E[f'(x)] Cov(x, y) (Stein): 2 m s_xy of a parabola."""
     result = transform(lambda x: x**2 - x, np.array([0.7]), np.array([[0.25]]))
     assert (result.slope @ np.array([0.1]))[0] == pytest.approx((2.0 * 0.7 - 1.0) * 0.1)
-
-
-def test_the_slope_is_wrong_in_the_fourth_order_only() -> None:
-    """E[3 x^2] = 3 m^2 + 3 s^2 of a cubic, where the rule of the third degree has 3 m^2 + s^2."""
-    result = transform(lambda x: x**3, np.array([0.7]), np.array([[0.04]]))
-    assert result.slope[0, 0] == pytest.approx(3.0 * 0.7**2 + 0.04)
 
 
 def test_a_singular_covariance_has_a_square_root() -> None:

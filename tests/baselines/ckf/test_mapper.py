@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pathspace_graph.baselines.filters import CkfMapper
 from pathspace_graph.estimators import make_online
@@ -20,8 +19,6 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 
 from ...scenes.drives import ahead, bean_track, corridor, exact_log, lap_log
-
-Array = NDArray[np.float64]
 
 
 def test_a_straight_drive_is_mapped_straight() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pathspace_graph.baselines.ckf_belief import HEAD, Belief
 from pathspace_graph.baselines.ckf_curves import SIGMA_START, CurveState
@@ -13,8 +12,6 @@ from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.bspline import BSpline
 
 from .scenes import COVARIANCE, around, begin, bend, straight_rows
-
-Array = NDArray[np.float64]
 
 UNBENT = CkfSettings(sigma_bend=1e9)
 """With these settings the expansion has no prior on the bending, as in the paper."""

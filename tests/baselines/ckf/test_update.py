@@ -92,18 +92,6 @@ def test_the_ridge_makes_no_difference_to_the_update(monkeypatch: pytest.MonkeyP
     np.testing.assert_allclose(results[0][1], results[1][1], atol=1e-6)
 
 
-def test_an_update_moves_the_curve_to_the_detections_and_reduces_its_covariance() -> None:
-    state = bend()
-    detections = detections_of(POINTS)
-    low, high = np.zeros(3), np.full(3, 12.0)
-    before, spread = state.foot_points(LEFT, POINTS, low, high).distance, np.trace(state.belief.covariance)
-    update(state, detections, classify(state, detections))
-    after = state.foot_points(LEFT, POINTS, low, high).distance
-    assert np.linalg.norm(after) < np.linalg.norm(before)
-    assert np.trace(state.belief.covariance) < spread
-    assert np.linalg.eigvalsh(state.belief.covariance)[0] > -1e-12
-
-
 def test_both_curves_update_the_pose_together() -> None:
     """Both rows are detected 0.2 m too far to the left, so the vehicle stands farther to the right."""
     state = straight_rows()

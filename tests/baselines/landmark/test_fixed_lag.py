@@ -139,9 +139,3 @@ def test_a_cone_first_detected_with_the_wrong_label_gets_its_own(monkeypatch: py
     for label in BOUNDARIES:
         assert (np.sign(points(track, label)[:, 1]) == (1 if label == LEFT else -1)).all()
     assert track.size == run(log).map().size
-
-
-def test_a_log_without_detections_gives_an_empty_map() -> None:
-    log = exact_log(ahead(5.0, 2.0), np.zeros((0, 2)), np.zeros(0, np.intp))
-    estimator = run(log)
-    assert estimator.map().size == 0 and not estimator.map().closed

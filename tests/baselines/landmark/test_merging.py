@@ -7,12 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pathspace_graph.baselines.landmark_association import (
-    compatible_pairs,
-    find_duplicates,
-    merge,
-    pairs_within,
-)
+from pathspace_graph.baselines.landmark_association import find_duplicates, merge
 from pathspace_graph.baselines.landmark_batch import remove_rare
 from pathspace_graph.baselines.landmark_map import LandmarkState
 from pathspace_graph.graph.gaussian import normal_equations
@@ -24,21 +19,25 @@ from pathspace_graph.settings.mapper import MapperSettings, RelinearizeSettings
 from .scenes import QUADRATIC, driven, oracle_system
 
 
-def test_pairs_have_one_label_and_the_newer_landmark_comes_first() -> None:
-    landmarks = np.array([[0.0, 0.0], [0.5, 0.0], [0.2, 0.0], [9.0, 0.0]])
-    newer, older = pairs_within(landmarks, np.array([LEFT, RIGHT, LEFT, LEFT]), 1.0)
-    np.testing.assert_array_equal(newer, [2])
-    np.testing.assert_array_equal(older, [0])
+def duplicates(points: list[float], labels: list[int], joint: np.ndarray, known: int) -> list[list[int]]:
+    """Newer and older landmarks of one cone, of landmarks along x."""
+    state = LandmarkState()
+    state.add(np.column_stack([points, np.zeros(len(points))]), np.array(labels))
+    entries, wide = Layout(state.keys).entries, np.asarray(np.kron(joint, np.eye(2)), np.float64)
+    found = find_duplicates(
+        state, known, lambda keys: wide[np.ix_(entries(keys), entries(keys))], MapperSettings()
+    )
+    return [column.tolist() for column in found]
+
+
+def test_pairs_are_near_have_one_label_and_the_newer_landmark_comes_first() -> None:
+    labels = [LEFT, RIGHT, LEFT, LEFT]
+    assert duplicates([0.0, 0.5, 0.2, 9.0], labels, np.eye(4), 4) == [[2], [0]]
 
 
 def test_a_landmark_is_in_one_pair_only_which_is_the_best() -> None:
-    """2 fits 0 better than 1 does; 3 and 0 are too far apart for their covariance."""
-    newer, older = np.array([1, 2, 3]), np.array([0, 0, 0])
-    offset = np.array([[0.3, 0.0], [0.1, 0.0], [0.0, 0.9]])
-    covariances = np.tile(0.02 * np.eye(2), (3, 1, 1))
-    np.testing.assert_array_equal(compatible_pairs(newer, older, offset, covariances), [1])
-    wide = 9.0 * 0.01 * np.eye(2)[None] + 1.01 * np.eye(2)
-    assert len(compatible_pairs(newer[2:], older[2:], offset[2:], wide)) == 1
+    """2 fits 0 better than 1 does; 3 and 2 are too far apart for their covariance."""
+    assert duplicates([0.0, 0.3, 0.1, 0.9], [LEFT] * 4, 0.005 * np.eye(4), 4) == [[2], [0]]
 
 
 @pytest.mark.parametrize(("correlation", "known", "expected"), [(0.0, 3, 1), (0.99, 3, 0), (0.0, 2, 0)])
@@ -46,15 +45,8 @@ def test_the_joint_covariance_decides_whether_two_are_one_cone(
     correlation: float, known: int, expected: int
 ) -> None:
     """0.5 m is little between independent landmarks with a sigma of 1 m, and much if they share the error."""
-    state = LandmarkState()
-    state.add(np.array([[0.0, 0.0], [9.0, 0.0], [0.5, 0.0]]), np.full(3, LEFT))
-    joint = np.asarray(np.kron(correlation + (1.0 - correlation) * np.eye(3), np.eye(2)), np.float64)
-    entries = Layout(state.keys).entries
-    newer, older = find_duplicates(
-        state, known, lambda keys: joint[np.ix_(entries(keys), entries(keys))], MapperSettings()
-    )
-    np.testing.assert_array_equal(newer, [2] * expected)
-    np.testing.assert_array_equal(older, [0] * expected)
+    joint = correlation + (1.0 - correlation) * np.eye(3)
+    assert duplicates([0.0, 9.0, 0.5], [LEFT] * 3, joint, known) == [[2] * expected, [0] * expected]
 
 
 @pytest.mark.parametrize("tolerance", [1e-12, 10.0])  # with the second, no factor becomes stale by itself

@@ -7,9 +7,8 @@ import pytest
 
 from pathspace_graph.baselines.landmark_batch import (
     LandmarkSystem,
-    Reassociation,
     predicted_covariances,
-    relabel,
+    reassociate,
     remove_rare,
 )
 from pathspace_graph.baselines.landmark_map import UNASSOCIATED, LandmarkState
@@ -21,8 +20,8 @@ from pathspace_graph.labels import LEFT, RIGHT
 from .scenes import normal_equations_of, oracle_system
 
 
-def reassociate(system: LandmarkSystem, state: LandmarkState) -> None:
-    Reassociation(state, system, system.settings).run()
+def assign_anew(system: LandmarkSystem, state: LandmarkState) -> None:
+    reassociate(system, state, system.eliminated(state), system.settings)
 
 
 @pytest.fixture
@@ -53,7 +52,7 @@ def test_lost_associations_are_found_again(optimum: tuple[LandmarkSystem, Landma
     lost = np.flatnonzero(detections.used)[::7]
     detections.landmark[lost] = UNASSOCIATED
     count = len(state)
-    reassociate(system, state)
+    assign_anew(system, state)
     assert len(state) == count
     found = detections.landmark[lost]
     assert (found == expected[lost]).mean() > 0.9
@@ -72,22 +71,40 @@ def test_a_landmark_that_was_lost_is_created_again(optimum: tuple[LandmarkSystem
     detections.landmark[rows] = UNASSOCIATED
     remove_rare(state, detections, 1)
     count = len(state)
-    reassociate(system, state)
+    assign_anew(system, state)
     assert len(state) > count
     assert (state.labels[count:] == label).all()
     assert np.hypot(*(state.landmarks[count:] - place).T).max() < 0.5
     assert np.isin(detections.landmark[rows], state.numbers[count:]).all()
 
 
-def test_a_landmark_takes_the_label_of_most_detections_in_its_gate() -> None:
-    state = LandmarkState()
-    state.add(np.zeros((2, 2)), np.array([LEFT, LEFT]))
-    state.vote(np.array([LEFT, LEFT, LEFT]), np.array([1, 1, 1]))
-    labels = np.array([RIGHT, RIGHT, LEFT, RIGHT])
-    rows, landmarks = np.array([0, 1, 2, 3]), np.array([0, 0, 0, 1])
-    relabel(state, labels, rows, landmarks, np.array([1.0, 1.0, 1.0, 9.0]), gate=6.0)
-    np.testing.assert_array_equal(state.labels, [RIGHT, LEFT])
-    np.testing.assert_array_equal(state.votes, [[1, 2], [0, 0]])
+def test_detections_beside_a_landmark_that_would_be_merged_create_none(
+    optimum: tuple[LandmarkSystem, LandmarkState],
+) -> None:
+    """0.8 m is outside its gates near the vehicle, and within the merge radius."""
+    system, state = optimum
+    detections, count = system.detections, len(state)
+    near = np.flatnonzero(detections.used & (np.hypot(*detections.point.T) < 7.0))
+    numbers, counts = np.unique(detections.landmark[near], return_counts=True)
+    rows = near[detections.landmark[near] == numbers[counts.argmax()]][::2]
+    assert len(rows) >= system.settings.growth.sightings
+    detections.landmark[rows] = UNASSOCIATED
+    detections.measured[rows] += [0.8, 0.0]
+    assign_anew(system, state)
+    assert not detections.used[rows].any()
+    assert len(state) == count
+
+
+def test_landmarks_take_the_label_of_most_detections_in_their_gate(
+    optimum: tuple[LandmarkSystem, LandmarkState],
+) -> None:
+    system, state = optimum
+    labels = state.labels.copy()
+    state.labels = np.full(len(labels), LEFT)
+    state.vote(np.full(99, LEFT), np.full(99, state.numbers[0]))  # earlier votes do not count
+    assign_anew(system, state)
+    np.testing.assert_array_equal(state.labels[: len(labels)], labels)
+    assert (labels == RIGHT).any() and state.votes.max() < 99
 
 
 def test_rare_landmarks_are_removed_and_the_others_keep_their_detections(bean: Log) -> None:

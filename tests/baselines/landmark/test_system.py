@@ -33,15 +33,6 @@ def test_the_cost_falls_along_the_gradient_of_the_rows(bean: Log) -> None:
     assert costs[0] - costs[1] == pytest.approx(-2.0 * vector @ step, rel=1e-4)
 
 
-def test_the_optimum_has_no_gradient(bean: Log) -> None:
-    system, state = oracle_system(bean, 60)
-    before = system.cost(state)
-    system.optimize(state)
-    hessian, vector = normal_equations_of(system, state)
-    assert system.cost(state) < before
-    assert np.abs(vector / np.sqrt(np.diagonal(hessian))).max() < 0.05
-
-
 def test_a_system_of_a_log_has_no_association_and_costs_nothing_at_dead_reckoning() -> None:
     log = exact_log(ahead(5.0, 1.0), np.array([[8.0, 2.0]]), np.array([LEFT]))
     system = LandmarkSystem.of_log(log, MapperSettings(), log.noise)

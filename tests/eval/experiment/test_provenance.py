@@ -19,7 +19,7 @@ from pathspace_graph import estimators as registry
 from pathspace_graph.cli import main
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.experiment import provenance
-from pathspace_graph.eval.experiment.provenance import code_of, made
+from pathspace_graph.eval.experiment.provenance import code_of, origin_of
 from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.study import Study, read_study_file
 from pathspace_graph.io.log_files import write_log
@@ -169,7 +169,7 @@ def test_a_worker_of_other_code_stops_the_study(
 
 
 def test_a_result_says_where_and_when_it_was_made(tmp_path: Path) -> None:
-    said = made("pathspace_graph.online.fixed_lag")
+    said = origin_of("pathspace_graph.online.fixed_lag")
     assert {"gtsam", "numpy", "python", "commit", "host", "processor", "blas", "date"} <= set(said)
     assert said["blas"] and said["processor"] and said["date"].endswith("+00:00")
     frame = run_study(study(tmp_path, estimators=("landmark-ckf",)), tmp_path / "out")

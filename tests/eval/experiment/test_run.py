@@ -17,7 +17,7 @@ from pathspace_graph.errors import OutputError, SettingsError
 from pathspace_graph.eval.experiment import run as study_run
 from pathspace_graph.eval.experiment import study as study_module
 from pathspace_graph.eval.experiment.run import run_study
-from pathspace_graph.eval.experiment.study import Drive, Study
+from pathspace_graph.eval.experiment.study import Study, StudyDrive
 from pathspace_graph.eval.experiment.tables import TIMES, without_times, write_study
 from pathspace_graph.io.log import Log
 from pathspace_graph.plausibility.judge import Hint
@@ -165,11 +165,6 @@ def test_cells_of_other_code_are_run_again_and_counted(
     assert Pretender.calls == CALLS
 
 
-def test_a_finished_study_runs_nothing(study: Study, finished: Path) -> None:
-    run_study(study, finished)
-    assert Pretender.calls == Fragile.calls == 0
-
-
 def test_failed_cells_are_kept_until_they_are_to_be_retried(
     study: Study, finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,14 +181,14 @@ def test_failed_cells_are_kept_until_they_are_to_be_retried(
 def test_a_log_that_cannot_be_simulated_fails_its_cells_only(
     study: Study, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = Drive.load
+    real = StudyDrive.load
 
-    def load(drive: Drive) -> tuple[Log, Sequence[Hint]]:
+    def load(drive: StudyDrive) -> tuple[Log, Sequence[Hint]]:
         if drive.seed == 1:
             raise ValueError("stuck")
         return real(drive)
 
-    monkeypatch.setattr(Drive, "load", load)
+    monkeypatch.setattr(StudyDrive, "load", load)
     frame = run_study(replace(study, estimators=("pretender",)))
     assert set(frame[frame["seed"] == 1]["failure"]) == {"ValueError: stuck"}
     assert set(frame[frame["seed"] == 0]["failure"]) == {""}

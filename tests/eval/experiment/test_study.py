@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 import tomllib
 from dataclasses import replace
@@ -173,12 +174,6 @@ def test_a_file_that_is_wrong_is_named(tmp_path: Path) -> None:
     assert read_study_file(file).name == "mine"
 
 
-def test_a_missing_track_names_the_nearest_file(tmp_path: Path) -> None:
-    (tmp_path / "oval.csv").write_text("")
-    with pytest.raises(InputError, match=r"ovel.csv.*the nearest is 'oval.csv'"):
-        load_tracks((tmp_path / "ovel.csv",))
-
-
 def test_a_study_is_found_by_name_or_refused_with_the_nearest() -> None:
     assert find_study(Path("degree")) == SHIPPED / "degree.toml"
     with pytest.raises(SettingsError, match="the nearest is 'degree'"):
@@ -321,6 +316,7 @@ def test_a_drive_is_the_same_by_geometry_seed_and_simulation_whatever_its_names(
     assert simulated_drive(renamed, 0, "quiet", two).id == drive.id
     assert simulated_drive(track, 1, "nominal", two).id != drive.id
     assert simulated_drive(track, 0, "nominal", three).id != drive.id
+    assert pickle.loads(pickle.dumps(drive)).id == drive.id, "it is an argument of cells"
 
 
 def test_the_last_digits_of_a_track_do_not_matter_to_its_drives_and_a_centimetre_does() -> None:

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.eval.experiment.study import Study
-from pathspace_graph.eval.experiment.tables import Table, track_tables
+from pathspace_graph.eval.experiment.tables import TextTable, track_tables
 from pathspace_graph.eval.metrics.measures import METRICS
 
 RUNS = {  # rmse (m) of laps 1, 2 and 3
@@ -77,7 +77,7 @@ def test_errors_with_a_sign_have_root_mean_squares() -> None:
 
 def test_a_table_keeps_its_units_and_escapes_what_latex_would_take_for_commands() -> None:
     rows = (("x|y", "2σ < 5 %"), ("z", "–"), ("z", "–"))
-    table = Table.of(("name", "rmse [m]"), rows, "50 % of a_b ± 1")
+    table = TextTable.of(("name", "rmse [m]"), rows, "50 % of a_b ± 1")
     assert table.rich().columns[1].header.plain == "rmse [m]"  # type: ignore[union-attr]
     latex = table.latex()
     assert r"\caption{50 \% of a\_b $\pm$ 1}" in latex and r"2$\sigma$ < 5 \%" in latex
@@ -85,7 +85,7 @@ def test_a_table_keeps_its_units_and_escapes_what_latex_would_take_for_commands(
 
 
 def test_names_are_aligned_to_the_left_and_numbers_to_the_right() -> None:
-    table = Table.of(("name", "a", ""), (("x|y", "1.0", ""), ("long name", "12.25", "*")), "Title")
+    table = TextTable.of(("name", "a", ""), (("x|y", "1.0", ""), ("long name", "12.25", "*")), "Title")
     assert [line.rstrip() for line in table.text().splitlines()] == [
         "Title",
         "",

@@ -71,6 +71,8 @@ def test_the_band_is_two_sigma_to_either_side_along_the_normal(scale: float) -> 
     centre = ring.spline.evaluate(u)
     np.testing.assert_allclose(np.linalg.norm(left - centre, axis=1), 2 * SHIFT * scale, rtol=1e-9)
     np.testing.assert_allclose(left + right, 2 * centre, atol=1e-12)
+    wide = uncertainty_band(SplineBoundary(ring.spline, 1e4 * ring.covariance), u, scale)[0]
+    np.testing.assert_allclose(np.linalg.norm(wide - centre, axis=1), 3.0 * scale, rtol=1e-9)  # it is cut
     # left of the direction of travel is inside of an anticlockwise ring
     middle = np.array([0.0, 20.0])
     assert (np.linalg.norm(left - middle, axis=1) < np.linalg.norm(right - middle, axis=1)).all()

@@ -13,8 +13,8 @@ from pathspace_graph.eval.metrics.accuracy import (
     boundary_errors,
     cone_distances,
     cone_errors,
+    cones_in_order,
     crossings,
-    driving_order,
     lap_metrics,
     mapped_points,
     true_curve,
@@ -116,12 +116,12 @@ def around(cones: Array) -> Truth:
 
 
 def test_cones_are_put_in_driving_order() -> None:
-    found = driving_order(around(np.random.default_rng(0).permutation(RING)), LEFT)
+    found = cones_in_order(around(np.random.default_rng(0).permutation(RING)), LEFT)
     np.testing.assert_array_equal(
         found, np.roll(RING, -int(np.argmin(np.linalg.norm(RING - found[0], axis=1))), axis=0)
     )
     np.testing.assert_array_equal(
-        driving_order(truth(RING), LEFT), RING
+        cones_in_order(truth(RING), LEFT), RING
     )  # without a path the file's own order
 
 

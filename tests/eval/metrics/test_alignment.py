@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.metrics.alignment import (
-    DIFFERENT,
     aligned_distance,
     differences,
     end_by_registration,
@@ -113,7 +112,7 @@ def test_a_bulge_is_told_with_its_place_length_and_distance() -> None:
     assert one.x == pytest.approx(-16.0, abs=0.2)
     assert one.y == pytest.approx(0.0, abs=0.3)
     assert one.distance == pytest.approx(1.86, abs=0.02)  # a control point of 2 m
-    half = 0.15 * np.sqrt(2.0 * np.log(2.0 / DIFFERENT)) * 17.0
+    half = 0.15 * np.sqrt(2.0 * np.log(2.0 / 0.5)) * 17.0
     assert one.length == pytest.approx(2.0 * half, abs=1.5)
     off, place = f"{one.distance:.2f} m from the known map", f"at x = {one.x:.1f} m, y = {one.y:.1f} m"
     assert one.line == f"the left boundary is up to {off} on {one.length:.0f} m, {place}"

@@ -165,11 +165,6 @@ def ring_truth() -> Truth:
     return truth(left, right)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-3, -0.02, 0.3])
-def test_a_turned_map_has_its_angle(angle: float) -> None:
-    assert turn_from_truth(rings(angle), ring_truth()).value == pytest.approx(angle, abs=1e-8)
-
-
 def test_landmarks_turn_as_curves_do() -> None:
     points = np.array([[5.0, 2.0], [20.0, 2.0], [40.0, -3.0]])
     turned = PointBoundary(points @ rotation(0.02).T, np.eye(6))

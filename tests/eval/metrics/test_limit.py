@@ -116,29 +116,6 @@ def test_a_log_without_truth_or_associations_is_refused() -> None:
 # --- what else the batch is told -------------------------------------------------------------------------
 
 
-def normalized_error(log: Log) -> tuple[float, int]:
-    """The squared error of the told landmarks by their joint covariance, and its degrees of freedom."""
-    system, solved = solve_oracle_landmarks(log)
-    assert log.truth is not None
-    errors = (solved.landmarks - log.truth.cones[solved.numbers]).ravel()
-    covariance = system.eliminated(solved).joint(solved.keys)
-    return float(errors @ np.linalg.solve(covariance, errors)), len(errors)
-
-
-@pytest.mark.parametrize("latency", [-0.12, 0.1])
-def test_told_the_errors_of_the_sensor_the_batch_errs_by_its_noise_only(latency: float) -> None:
-    faults = SensorFaults(latency=latency, yaw=-0.0175, lateral=0.1, range_scale=0.08, range_bias=-0.19)
-    settings, found = SimulationSettings(laps=1, faults=Faults(sensor=faults)), []
-    for seed in range(4):
-        log = simulate(bean_track(), settings, seed)
-        found.append(normalized_error(log))
-    assert log.truth is not None
-    untold = replace(log, truth=replace(log.truth, sensor=None))
-    assert normalized_error(untold)[0] > found[-1][0]
-    error, freedom = np.sum(found, axis=0)
-    assert error / freedom == pytest.approx(1.0, abs=4 * np.sqrt(2 / freedom))
-
-
 @pytest.mark.parametrize("bend", [0.0, 0.004, -0.004])
 def test_detections_without_noise_are_exact_without_the_errors_of_the_sensor(bend: float) -> None:
     """Each told detection, from the true pose at its told stamp, lies on its cone."""

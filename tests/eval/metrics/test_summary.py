@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize
 from pathspace_graph.factors.noise import MeasuredNoise
@@ -16,8 +15,6 @@ from pathspace_graph.io.results import BatchRun, CycleRecord, LapBatches, RunNoi
 from pathspace_graph.labels import LEFT, RIGHT
 
 from .straight_maps import line, row, truth
-
-Array = NDArray[np.float64]
 
 ANGLE = np.arange(0.0, 2.5 * 2 * np.pi, 0.02)
 """Two and a half laps are driven on a circle of 25 m, at a third of a radian a second."""
