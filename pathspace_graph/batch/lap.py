@@ -218,7 +218,6 @@ MISS_NEAR: Final = (
 SAME_CONE: Final = 0.5  # distance of two detections of one cone, as the optimum places them (m)
 SEEN_AGAIN: Final = 0.25  # least number of detections of a cone, relative to the median of the used ones
 MISS_SHARE: Final = 1.0 / 3.0  # least share of near detections on no boundary that is a miss
-MISS_SHOWN: Final = 3  # largest number of reported stretches
 
 
 def are_of_cones(detections: DetectionTable, points: Array) -> BoolArray:
@@ -319,7 +318,7 @@ def unmapped(detections: DetectionTable, poses: Array) -> str:
     count = np.bincount(stretch, near)
     poor = (count >= MISS_DETECTIONS) & (np.bincount(stretch, missed, len(count)) >= MISS_SHARE * count)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], poor, [False]])))
-    ends = np.minimum(MISS_STRETCH * edges.reshape(-1, 2), driven[-1]).tolist()[:MISS_SHOWN]
+    ends = np.minimum(MISS_STRETCH * edges.reshape(-1, 2), driven[-1]).tolist()[:3]
     told = ", ".join(f"{a:.3g} to {b:.3g} m" for a, b in ends)
     where = f" ({told} of the drive)" if told else ""
     share = 100.0 * missed.sum() / near.sum()

@@ -40,7 +40,6 @@ POINT: Final = 2  # entries of every other variable but the sensor's calibration
 INDEX_BITS: Final = 56  # low bits of a key, which hold its index; its letter is in the highest byte
 UNKNOWN: Final = -1  # column of a key that a layout does not hold
 NO_KEYS: Final = np.zeros(0, np.intp)
-_NAMES_IN_MESSAGE: Final = 3
 
 
 def letter_keys(letter: str) -> tuple[int, int]:
@@ -103,7 +102,7 @@ def name(key: int) -> str:
 
 def names(keys: IntArray) -> str:
     """Return the first keys of an array as text for a message."""
-    return ", ".join(name(key) for key in keys[:_NAMES_IN_MESSAGE].tolist())
+    return ", ".join(name(key) for key in keys[:3].tolist())
 
 
 class Layout:

@@ -31,7 +31,6 @@ SEARCH_INTERVAL: Final = 0.5  # least time between two attempts (s)
 LEAST_PATH: Final = 20.0  # least length of the path without a given start (m)
 AT_START: Final = (1.0, 1.0, 0.2), (4.0, 0.5)  # sigmas and reach of a given start (m, m, rad)
 WIDENING: Final = 3.0  # inflation of the sigmas of a place: its detections are used again
-RESTART_STEPS: Final = 2  # Gauss-Newton steps after the restart
 
 
 class Search(Copyable):
@@ -122,7 +121,7 @@ def restart_window(smoother: CurveSmoother, first_cycle: int, place: Place) -> A
     smoother.add_pose_prior(smoother.next_cycle - 1, widened(place))
     locate_poses(state)
     smoother.reassociate()
-    for _ in range(RESTART_STEPS):
+    for _ in range(2):
         smoother.step(settings.sigma_step)
     return difference(state.poses[-1], before)
 
