@@ -219,9 +219,9 @@ def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
 def begun(
     cycles: Sequence[SeenCycle], odometry: Odometry, known: MeasuredNoise | None, *, of_lines: bool
 ) -> Measurement | LineMeasurement | None:
-    """Start a measurement on cones or on lines; None if not even the odometry's noise can be estimated."""
+    """Start a measurement on cones or on lines; None without a cycle, or without noise of the odometry."""
     of_twists = twist_noise(odometry)
-    if of_twists is None:
+    if of_twists is None or len(cycles) == 0:
         return None
     sigma, interval = of_twists[0].min(axis=0), of_twists[1]
     found = known or MeasuredNoise(sigma, np.array(ASSUMED_DRIFT), interval)

@@ -126,7 +126,7 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: Path(file).write_bytes(b"picture"))
     monkeypatch.setattr("pathspace_graph.eval.figures.style.SUFFIXES", (".png",))
     study, rows = "pathspace_graph.eval.experiment", [{"lap": 1, "rmse": 0.5}, {"lap": None}]
-    monkeypatch.setattr(f"{study}.study.Drive.load", lambda _: (recorded.log, ()))
+    monkeypatch.setattr(f"{study}.study.StudyDrive.load", lambda _: (recorded.log, ()))
     monkeypatch.setattr(f"{study}.run.measure", lambda *_, **__: rows)
     monkeypatch.setattr(f"{study}.run.stage_times", lambda _: [])
     monkeypatch.setattr(f"{study}.run.summarize", lambda *_, **__: {})

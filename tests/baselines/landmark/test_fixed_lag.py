@@ -13,6 +13,7 @@ from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.trajectory import position_rms, trajectory_errors
+from pathspace_graph.front_end.sides import SideJudge
 from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
@@ -134,7 +135,7 @@ def test_a_cone_first_detected_with_the_wrong_label_gets_its_own(monkeypatch: py
     swapped = np.array([RIGHT, LEFT, UNKNOWN])
     for i in range(6):
         cycles[i] = replace(cycles[i], labels=swapped[cycles[i].labels])
-    monkeypatch.setattr("pathspace_graph.front_end.sides.MIN_VOTES", 1000)  # colours are not swapped
+    monkeypatch.setattr(SideJudge, "_judge_colours", lambda *_: None)  # colours are not swapped
     track = run(with_cycles(log, cycles)).map()
     for label in BOUNDARIES:
         assert (np.sign(points(track, label)[:, 1]) == (1 if label == LEFT else -1)).all()
