@@ -130,7 +130,7 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     monkeypatch.setattr(f"{study}.run.measure", lambda *_, **__: rows)
     monkeypatch.setattr(f"{study}.run.stage_times", lambda _: [])
     monkeypatch.setattr(f"{study}.run.summarize", lambda *_, **__: {})
-    monkeypatch.setattr(f"{study}.run.made", lambda _: versions() | {"date": "then"})
+    monkeypatch.setattr(f"{study}.run.origin_of", lambda _: versions() | {"date": "then"})
     monkeypatch.setattr(f"{study}.tables.plot_differences", lambda *_: Figure())
     track = write_round_track(tmp_path)
     (tmp_path / "small.toml").write_text(STUDY.format(track=track))
