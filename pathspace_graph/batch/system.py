@@ -104,11 +104,6 @@ class CurveGauge:
             owner=np.repeat(owners(self.cycle, self.label), POINT),
         )
 
-    def carried(self, control_points: Array, poses: Array, poses_after: Array) -> Array:
-        """Move control points (m, 2) rigidly with the poses beside them, from and to (P, 3)."""
-        before, after = poses[self.cycle], poses_after[self.cycle]
-        return after[:, :2] + turned(control_points - before[:, :2], after[:, 2] - before[:, 2])
-
 
 def curve_gauge(state: State, label: int, sigma: float, until: int | None = None) -> CurveGauge:
     """Build the gauge of the present control points, beside poses of cycles before `until`."""

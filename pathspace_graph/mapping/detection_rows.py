@@ -33,13 +33,9 @@ class DetectionRows:
         """Residuals (m,) in sigmas."""
         return np.asarray(self.residual / self.sigma)
 
-    def scale(self, weights: Array) -> Array:
-        """Factors (m,) that whiten the rows and apply robust weights (m,), in 1/m."""
-        return np.asarray(np.sqrt(weights) / self.sigma)
-
     def weighted(self, weights: Array, owner: IntArray) -> Rows:
         """Whiten the rows and apply robust weights (m,); each row is part of the factor `owner` (m,)."""
-        scale = self.scale(weights)
+        scale = np.sqrt(weights) / self.sigma
         return Rows(self.keys, self.jacobian * scale[:, None], self.residual * scale, owner)
 
 
