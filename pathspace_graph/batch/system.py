@@ -389,9 +389,10 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     drives.
     """
     factors, graph = [*drive_factors(system, at)], gtsam.NonlinearFactorGraph()
+    track = system.track(at.state)
     for label, gauge in system.gauges.items():
         factors += [factor_beside(gauge, j) for j in range(len(gauge.keys))]
-        factors += curve_factors(system.track(at.state), label, spacing=False)
+        factors += curve_factors(track, label, spacing=False)
     for factor in factors:
         graph.add(factor)
     return graph

@@ -1,5 +1,7 @@
 """The factors of curves in GTSAM's own classes, for the graphs of window and batch."""
 
+from typing import Any
+
 import gtsam
 import numpy as np
 
@@ -25,7 +27,7 @@ def curve_factors(track: CurveMap, label: int, spacing: bool = True) -> list[gts
     detections, settings, state = track.detections, track.settings, track.state
     boundary, active, rows = state.boundaries[label], state.active(label), detections.used_on(label)
 
-    def seen(rows: IntArray) -> dict[str, object]:
+    def seen(rows: IntArray) -> dict[str, Any]:
         return {
             "pose_keys": pose_keys(detections.cycle[rows]),
             "control_keys": state.control_keys(label).tolist(),
@@ -39,16 +41,19 @@ def curve_factors(track: CurveMap, label: int, spacing: bool = True) -> list[gts
 
     u = detections.u[rows]
     before, past = _room(boundary, active, u, settings.spline.refine_room)
-    on_curve = {"low": u - before, "high": boundary.within_trusted(u + past)}
-    sigma_model = settings.spline.sigma_model
     factors: list[gtsam.NonlinearFactor] = [
-        *spline_projection_factors(sigma_model=sigma_model, **on_curve, **seen(rows))  # type: ignore[arg-type]
+        *spline_projection_factors(
+            low=u - before,
+            high=boundary.within_trusted(u + past),
+            sigma_model=settings.spline.sigma_model,
+            **seen(rows),
+        )
     ]
     rows = rows[detections.station[rows] != NO_STATION]
     if track.stations is not None and len(rows):
         station = detections.station[rows]
-        at = {"u": track.stations.u[station], "sigma_station": track.stations.sigma[station]}
-        factors += station_factors(**at, **seen(rows))  # type: ignore[arg-type]
+        at, sigma_station = track.stations.u[station], track.stations.sigma[station]
+        factors += station_factors(u=at, sigma_station=sigma_station, **seen(rows))
     return factors + _weak_priors(track, label, active, spacing)
 
 
