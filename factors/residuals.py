@@ -88,16 +88,6 @@ def landmark_residuals(poses: Array, landmarks: Array, points_vehicle: Array) ->
     return LandmarkResiduals(expected - points_vehicle, by_pose, by_landmark)
 
 
-def pair_residuals(first: Array, second: Array, nominal: Array) -> tuple[Array, Array]:
-    """Return `r_j = |b_j - a_j| - nominal_j` (k,) of points a, b (k, 2) in m, and the derivatives by b_j.
-
-    `dr/db_j = -dr/da_j` (k, 2) is the direction from a_j to b_j, and zero for coinciding points.
-    """
-    offset = second - first
-    length = np.hypot(offset[:, 0], offset[:, 1])
-    return length - nominal, offset / np.maximum(length, np.finfo(float).tiny)[:, None]
-
-
 def smoothness_coefficients(abscissae: Array, period: float | None, spacing: float | None = None) -> Array:
     """Coefficients (m - 2, 3) of second divided differences over abscissae (m,), times the squared spacing.
 

@@ -143,7 +143,7 @@ class CurveState:
     def boundary(self, label: int) -> Boundary:
         """Convert a curve to a confirmed boundary, for registration and simplification."""
         curve, settings = self.curves[label], self.settings
-        boundary = Boundary(curve.knots, curve.periodic, settings.spline, settings.gauge)
+        boundary = Boundary(curve.knots, curve.periodic, settings.spline)
         boundary.confirmed_end = boundary.tables.high
         return boundary
 

@@ -166,14 +166,6 @@ class LandmarkMap:
     def linearized(self, cycles: IntArray) -> None:
         self.detections.mark_linearized()
 
-    structure = None  # there are no weak priors
-
-    def gauge(self, whole: bool) -> list[Rows]:
-        return []
-
-    def linear_gauge(self, whole: bool) -> list[Rows]:
-        return []
-
     def activate(self, keys: IntArray) -> None: ...  # every landmark is always active
 
     def activate_all(self) -> None: ...

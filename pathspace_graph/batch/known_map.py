@@ -75,7 +75,7 @@ class KnownMap:
         """Convert a curve to a boundary; the keys of its control points begin at the number `first`."""
         spline = self.splines[label]
         own = replace(settings.spline, degree=spline.degree)
-        boundary = Boundary(spline.knots, spline.periodic, own, settings.gauge, first)
+        boundary = Boundary(spline.knots, spline.periodic, own, first)
         boundary.confirmed_end = self.confirmed[label]
         if not spline.periodic:
             end = np.array([boundary.confirmed_end])

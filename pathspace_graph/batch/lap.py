@@ -42,11 +42,10 @@ from pathspace_graph.spline.bspline import BSpline
 from .optimizer import Convergence, Effort, Optimizer, Stage
 from .simplification import map_block, own_settings, simplified
 from .start import StartMap, aligned_odometry, start_odometry
-from .system import BatchSystem, Evaluation, curve_gauge
+from .system import BatchSystem, Evaluation, weak_priors
 
 FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, tolerance=10.0)  # limited, to finish in time
 FROM_ODOMETRY: Final = Effort(rounds=24, tolerance=10.0)
-OPEN_SLIDE: Final = 10.0  # weak prior on the slide of an open curve's control points (m): online has one, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +159,9 @@ def marginal_of(
     covariance of the dense marginal.
     """
     state, variables = at.state, at.state.variables
-    sigma = system.sigma_slide if state.closed else OPEN_SLIDE
-    gauges = {label: curve_gauge(state, label, sigma, first_kept) for label in state.boundaries}
-    _, information, vector = marginal_before(system.rows(at, gauges), variables, first_kept)
+    gauge = system.gauge if state.closed else system.settings.gauge
+    weak = weak_priors(state, gauge, first_kept)
+    _, information, vector = marginal_before(system.rows(at, weak), variables, first_kept)
     covariance = np.linalg.inv(information)
     T = block_diag(np.eye(len(variables.calibrations)), change, np.eye(POSE))
     here = np.concatenate([variables.calibrations, few.map_points.ravel(), state.poses[first_kept]])

@@ -87,7 +87,7 @@ def extended(points: Array, beyond: float) -> Array:
 def boundary_of(spline: BSpline, settings: MapperSettings) -> tuple[Boundary, Array]:
     """Convert a curve to a confirmed boundary; return it and its control points (m, 2)."""
     spline = spline if spline.periodic else spline.unclamp()
-    boundary = Boundary(spline.knots, spline.periodic, exact_settings(settings.spline), settings.gauge)
+    boundary = Boundary(spline.knots, spline.periodic, exact_settings(settings.spline))
     boundary.confirmed_end = boundary.tables.high
     return boundary, spline.distinct_control_points
 

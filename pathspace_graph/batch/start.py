@@ -84,7 +84,7 @@ class StartMap:
         state = State()
         for label, spline in self.splines.items():
             own = replace(exact_settings(settings.spline), degree=spline.degree)
-            boundary = Boundary(spline.knots, spline.periodic, own, settings.gauge)
+            boundary = Boundary(spline.knots, spline.periodic, own)
             boundary.confirmed_end = self.ends.get(label, boundary.tables.high)
             state.add_boundary(label, boundary, spline.distinct_control_points)
         add_drive(state, self.poses, self.calibration)

@@ -1,6 +1,6 @@
 """The least-squares problem of one or several whole logs: its cost at a state, and its linearization."""
 
-from collections.abc import Callable, Iterator, Mapping, MutableSequence, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -11,7 +11,6 @@ from scipy.spatial import KDTree
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.gtsam_factors import fill, pose_array
 from pathspace_graph.factors.linear import keys_of_factor
 from pathspace_graph.factors.noise import huber_loss, huber_weights
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
@@ -35,7 +34,6 @@ from pathspace_graph.graph.variables import (
     are_poses,
     of_sensor,
     pose_key,
-    pose_keys,
 )
 from pathspace_graph.graph.window import check_keys, check_linear, user_rows
 from pathspace_graph.labels import UNKNOWN
@@ -44,73 +42,27 @@ from pathspace_graph.mapping.detection_rows import NO_ROWS, DetectionRows, Stati
 from pathspace_graph.mapping.detections import NO_STATION, DetectionTable
 from pathspace_graph.mapping.gtsam_graph import curve_factors
 from pathspace_graph.mapping.state import GivenFactor, State
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.mapping.weak_priors import WeakPriors
+from pathspace_graph.settings.mapper import GaugeSettings, MapperSettings
 
 from .association import DIRECTION_PENALTY, associate, cone_stations, headings, nearest_by
 
 LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
 SETTLE_FEET: Final = 16  # largest number of refinements of the foot points before a step
 SETTLED_FOOT: Final = 1e-3  # largest move of a converged foot point (m along the curve)
-SIGMA_SLIDE: Final = 2.0  # standard deviation of a control point's slide along a curve with stations (m)
+
+HELD_SPACING: Final = 0.05  # `gauge.sigma_spacing` of curves without stations
 
 OwnFactors = Sequence[gtsam.NonlinearFactor] | Callable[[State], Sequence[gtsam.NonlinearFactor]]
 """The user's factors in a batch: those on control points are made of its present curves."""
 
 
-@dataclass(frozen=True, eq=False)
-class CurveGauge:
-    """The residuals `(h_k . (c_j - p_k) - ahead_j) / sigma` of a curve's control points c_j.
-
-    p_k and h_k are position and heading of the pose beside which c_j began. Detections do not constrain the
-    control points along the curve, so they would slide. The gauge keeps them beside a pose, and leaves the
-    map free.
-    """
-
-    label: int
-    keys: IntArray  # (m,) keys of the control points
-    cycle: IntArray  # (m,) perception cycles of the poses beside them
-    ahead: Array  # (m,) distances of the control points ahead of their poses (m)
-    sigma: float  # standard deviation of that distance (m)
-
-    def terms(self, control_points: Array, beside: Array) -> tuple[Array, Array, Array]:
-        """Linearize whitened residuals (m,) of control points (m, 2) beside poses (m, 3)."""
-        heading = headings(beside) / self.sigma
-        arm = control_points - beside[:, :2]
-        by_theta = heading[:, 0] * arm[:, 1] - heading[:, 1] * arm[:, 0]
-        residual = (heading * arm).sum(axis=1) - self.ahead / self.sigma
-        return residual, heading, np.column_stack([-heading, by_theta])
-
-    def rows(self, control_points: Array, poses: Array) -> Rows:
-        """Rows of `terms` on [control point | pose], given all poses (P, 3)."""
-        residual, by_point, by_pose = self.terms(control_points, poses[self.cycle])
-        jacobian = np.column_stack([by_point, by_pose])
-        return Rows(self._keys_beside, jacobian, residual, owners(self.cycle, self.label))
-
-    @property
-    def _keys_beside(self) -> IntArray:
-        return np.column_stack([self.keys, pose_keys(self.cycle)])
-
-    def damping(self, control_points: Array, poses: Array, weight: float) -> Rows:
-        """Rows `sqrt(weight) (dc_j - dp_k - dtheta_k J (c_j - p_k))`, two for each control point.
-
-        They damp (1/m^2) motion relative to the pose beside it, but not a rotation of the map with its poses.
-        """
-        arm = control_points - poses[self.cycle, :2]
-        by_point, by_theta = np.tile(np.eye(POINT), (len(arm), 1)), np.column_stack([arm[:, 1], -arm[:, 0]])
-        return Rows(
-            keys=np.repeat(self._keys_beside, POINT, axis=0),
-            jacobian=np.sqrt(weight) * np.column_stack([by_point, -by_point, by_theta.ravel()]),
-            residual=np.zeros(POINT * len(arm)),
-            owner=np.repeat(owners(self.cycle, self.label), POINT),
-        )
-
-
-def curve_gauge(state: State, label: int, sigma: float, until: int | None = None) -> CurveGauge:
-    """Build the gauge of the present control points, beside poses of cycles before `until`."""
-    control_points, cycle = state.control_points(label), _nearest_poses(state, label, until)
-    beside = state.poses[cycle]
-    ahead = (headings(beside) * (control_points - beside[:, :2])).sum(axis=1)
-    return CurveGauge(label, state.control_keys(label), cycle, ahead, sigma)
+def weak_priors(state: State, settings: GaugeSettings, until: int | None = None) -> dict[int, WeakPriors]:
+    """Keep all control points where they are, as seen from the poses of cycles before `until` beside them."""
+    return {
+        label: WeakPriors.of(state, label, curve.everything, _nearest_poses(state, label, until), settings)
+        for label, curve in state.boundaries.items()
+    }
 
 
 def _nearest_poses(state: State, label: int, until: int | None) -> IntArray:
@@ -170,7 +122,7 @@ class BatchSystem:
         self._own, self._given = own, given
         self._given_rows: list[Rows] = []  # the user's factors of an online drive, at values of zero
         self.gate = LOOSE_GATE  # of the detections in use (sigmas)
-        self.gauges: dict[int, CurveGauge] = {}  # of each boundary
+        self.weak: dict[int, WeakPriors] = {}  # of the control points of each boundary
         self.stations: Stations | None = None  # stations of closed curves, if they are used
         self._sigma = np.ones((2, len(detections)))  # across and along the curves, of this round (m)
 
@@ -181,7 +133,7 @@ class BatchSystem:
         self.chains[drive] = replace(self.chains[drive], calibration_sigma=sigma)
 
     def begin(self, state: State, stations: bool = False) -> None:
-        """Rebuild the gauges and the user's factors on the present control points, after knots have changed.
+        """Rebuild weak priors and the user's factors on the present control points, after knots have changed.
 
         With `stations`, the cones of closed curves constrain the detections along them. SettingsError for a
         user's factor that cannot be used.
@@ -191,12 +143,13 @@ class BatchSystem:
         check_linear(self.own, lambda one: variables.gtsam_values(keys_of_factor(one)), constant=False)
         self._given_rows = by_widths([rows for one in self._given for rows in one.on(state)])
         self.stations = cone_stations(state, self.detections, self.settings) if stations else None
-        self.gauges = {label: curve_gauge(state, label, self.sigma_slide) for label in state.boundaries}
+        self.weak = weak_priors(state, self.gauge)
 
     @property
-    def sigma_slide(self) -> float:
-        """Standard deviation of a control point's slide along its curve (m)."""
-        return SIGMA_SLIDE if self.stations else self.settings.batch.sigma_slide
+    def gauge(self) -> GaugeSettings:
+        """Settings of the weak priors. Only stations determine a slide, so only they leave room for one."""
+        gauge = self.settings.gauge
+        return gauge if self.stations is not None else replace(gauge, sigma_spacing=HELD_SPACING)
 
     @property
     def settings(self) -> MapperSettings:
@@ -232,7 +185,7 @@ class BatchSystem:
         unused = len(self.detections) - int(np.isfinite(across.sigma).sum())  # each as one at the gate
         whitened = np.concatenate([across.whitened, along.whitened, np.full(unused, self.gate)])
         cost = half_square(drive) + float(huber_loss(whitened, self.settings.gate.huber).sum())
-        cost += half_square(self._priors(state, self.gauges))
+        cost += half_square(self._priors(state, self.weak))
         own_rows, own_cost = by_widths(user_rows(self.own, state.variables)), 0.0
         if self.own:
             values = state.variables.gtsam_values(state.variables.keys)
@@ -295,24 +248,23 @@ class BatchSystem:
             self._sigma[1, rows] = seen.sigma
         return replace(seen, sigma=self._sigma[1, rows])
 
-    def rows(self, at: Evaluation, gauges: Mapping[int, CurveGauge] | None = None) -> list[Rows]:
+    def rows(self, at: Evaluation, weak: Mapping[int, WeakPriors] | None = None) -> list[Rows]:
         """All whitened rows of Gauss-Newton at a state; rows of detections have robust weights."""
         groups = [*at.drive]
         for seen in (at.along, at.across):
             owner = owners(self.detections.cycle[seen.rows], self.detections.boundary[seen.rows])
             groups.append(seen.weighted(huber_weights(seen.whitened, self.settings.gate.huber), owner))
-        return groups + self._priors(at.state, gauges or self.gauges)
+        return groups + self._priors(at.state, weak or self.weak)
 
-    def _priors(self, state: State, gauges: Mapping[int, CurveGauge]) -> list[Rows]:
-        """Rows of the weak priors: gauges, and as online smoothness and anchors of control points."""
-        beside = [gauge.rows(state.control_points(label), state.poses) for label, gauge in gauges.items()]
-        on_points = self.track(state).linear_gauge(whole=True)
-        return beside + [replace(rows, owner=-1 - rows.owner) for rows in on_points]
+    def _priors(self, state: State, weak: Mapping[int, WeakPriors]) -> list[Rows]:
+        """Rows of the weak priors, by label."""
+        groups = [(label, rows) for label, one in weak.items() for rows in one.rows(state.variables)]
+        return [replace(rows, owner=owners(rows.owner, label)) for label, rows in groups]
 
     def track(self, state: State) -> CurveMap:
         """The curves of a state with the detections of the problem."""
         track = CurveMap(self.settings, state)
-        track.detections, track.stations = self.detections, self.stations
+        track.detections, track.stations, track.weak = self.detections, self.stations, self.weak
         return track
 
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
@@ -325,8 +277,12 @@ class BatchSystem:
 
     def damping(self, state: State, weight: float) -> list[Rows]:
         """Rows that damp the motion of control points relative to the poses beside them (1/m^2)."""
-        points, poses = state.control_points, state.poses
-        return [gauge.damping(points(label), poses, weight) for label, gauge in self.gauges.items()]
+        here, groups = state.variables, list[Rows]()
+        for label, one in self.weak.items():
+            root = np.tile(np.sqrt(weight) * np.eye(POINT), (len(one.keys), 1, 1))
+            rows = replace(one, whitener=root).rows(here)[0]
+            groups.append(replace(rows, residual=np.zeros(len(rows)), owner=owners(rows.owner, label)))
+        return groups
 
     def retract(self, state: State, step: Array) -> State:
         """Return the state after a step (n,) in relative coordinates.
@@ -340,8 +296,8 @@ class BatchSystem:
             own, aim = poses[part], goal[part]
             driven = seen_after_step(own[1:, :2], own[:-1], aim[1:, :2], aim[:-1])
             after.poses[part][1:, :2] = aim[0, :2] + np.cumsum(turned(driven, aim[:-1, 2]), axis=0)
-        for label, gauge in self.gauges.items():
-            points, k = after.control_points(label), gauge.cycle
+        for label, one in self.weak.items():
+            points, k = after.control_points(label), one.cycle
             seen = seen_after_step(state.control_points(label), poses[k], points, goal[k])
             points[:] = to_map(seen, after.poses[k])
         return after
@@ -390,9 +346,8 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     """
     factors, graph = [*drive_factors(system, at)], gtsam.NonlinearFactorGraph()
     track = system.track(at.state)
-    for label, gauge in system.gauges.items():
-        factors += [factor_beside(gauge, j) for j in range(len(gauge.keys))]
-        factors += curve_factors(track, label, spacing=False)
+    for label in at.state.boundaries:
+        factors += curve_factors(track, label)
     for factor in factors:
         graph.add(factor)
     return graph
@@ -432,20 +387,3 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
         sigmas = noises.Diagonal.Sigmas(np.array(calibration.sigmas))
         yield gtsam.PriorFactorVector(sensor_key, np.array(calibration.means), sigmas)
     yield from system.own
-
-
-def factor_beside(gauge: CurveGauge, j: int) -> gtsam.CustomFactor:
-    """Build the factor that keeps control point j of a curve beside its pose."""
-    point_key, cycle = int(gauge.keys[j]), int(gauge.cycle[j])
-    alone = replace(gauge, ahead=gauge.ahead[j : j + 1])
-
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: MutableSequence[Array] | None) -> Array:
-        pose = values.atPose2(pose_key(cycle))
-        point = np.array(values.atPoint2(point_key))
-        residual, by_point, by_pose = alone.terms(point[None], pose_array(pose)[None])
-        if H is not None:  # GTSAM's tangents of a pose are in its own frame
-            by_pose[:, :2] = by_pose[:, :2] @ rotation(pose.theta())
-            fill(H, [by_point, by_pose])
-        return residual
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [point_key, pose_key(cycle)], error)

@@ -144,7 +144,6 @@ class InactiveMap:
         self.anchors: IntArray = NO_KEYS  # (a,) poses that the last conditional depends on
         self._old_anchors: IntArray = NO_KEYS  # they were eliminated with the next conditional
         self._given: IntArray = NO_KEYS  # active variables that the conditionals depend on
-        self._shared: list[gtsam.GaussianFactor] = []
         self._active: tuple[Layout, Layout, IntArray] | None = None
         """Layout of all variables, that of the active ones, and their columns in the former."""
 
@@ -175,19 +174,11 @@ class InactiveMap:
         return self._active[1:]
 
     def push(
-        self,
-        prior: gtsam.GaussianFactorGraph,
-        keys: IntArray,
-        keyframes: IntArray,
-        shared: Sequence[gtsam.GaussianFactor],
+        self, prior: gtsam.GaussianFactorGraph, keys: IntArray, keyframes: IntArray
     ) -> gtsam.GaussianFactorGraph:
-        """Move variables (k,), keyframes and `shared` factors from a prior to the net; return what remains.
-
-        The owners of the shared factors add them again once all variables are active.
-        """
-        graph = graph_of(prior, *shared)
-        frontals = np.intersect1d(np.append(keys, keyframes), keys_of(graph))
-        conditional, remaining = eliminate(graph, frontals)
+        """Move variables (k,) and keyframes from a prior to the net; return what remains."""
+        frontals = np.intersect1d(np.append(keys, keyframes), keys_of(prior))
+        conditional, remaining = eliminate(prior, frontals)
         self.net.push_back(conditional)
         self.keys = np.union1d(self.keys, keys)
         self._old_anchors = np.union1d(self._old_anchors, keyframes)
@@ -196,7 +187,6 @@ class InactiveMap:
         self._given = np.setdiff1d(
             np.union1d(self._given, separator), np.append(self.keys, self._old_anchors)
         )
-        self._shared = [*self._shared, *shared]
         self._active = None
         return remaining
 
@@ -213,11 +203,10 @@ class InactiveMap:
         variables.values[entries] = variables.reference[entries] + solution.vector(self.keys.tolist())
 
     def joint_prior(self, prior: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
-        """Return the prior of active and inactive variables, without the `shared` factors of `push`."""
+        """Return the prior of active and inactive variables."""
         if len(self) == 0:
             return prior
-        negative = [factor.negate() for factor in self._shared]
-        joint = graph_of(gtsam.HessianFactor(graph_of(prior, self.net, *negative)))
+        joint = graph_of(gtsam.HessianFactor(graph_of(prior, self.net)))
         return eliminate(joint, self._old_anchors)[1] if len(self._old_anchors) else joint
 
 
@@ -236,7 +225,6 @@ class Link:
     """Conditional of some variables, given others, in the frame of an anchor: its mean is `y = G z + e`."""
 
     factor: RelativeFactor
-    shared: tuple[RelativeFactor, ...]  # weak priors in it, which their owners add again to an active map
     leaving: Layout  # variables y: map points, older anchors, and the origin in the last link
     others: Layout  # variables z
     gain: Array  # (n, m) G
@@ -272,30 +260,29 @@ class InactiveChain(InactiveMap):
         self,
         prior: gtsam.GaussianFactorGraph,
         keys: IntArray,
-        shared: Sequence[gtsam.GaussianFactor],
         variables: Variables,
     ) -> gtsam.GaussianFactorGraph:
-        """Move map points (k,), keyframes and `shared` factors from a prior to a new link; return the rest.
+        """Move map points (k,) and keyframes from a prior to a new link; return the rest.
 
         The anchor is the oldest pose of the window.
         """
         known = variables
         if not self.links:
             prior, known = on_origin(prior, variables), self._with_poses(variables)
-        graph, leaving = graph_of(prior, *shared), np.concatenate([keys, variables.keyframes, [ORIGIN_KEY]])
-        frontals = np.intersect1d(leaving, keys_of(graph))
-        conditional, remaining = eliminate(graph, frontals)
-        self.links.append(new_link(conditional, frontals, shared, pose_key(variables.first_cycle), known))
+        leaving = np.concatenate([keys, variables.keyframes, [ORIGIN_KEY]])
+        frontals = np.intersect1d(leaving, keys_of(prior))
+        conditional, remaining = eliminate(prior, frontals)
+        self.links.append(new_link(conditional, frontals, pose_key(variables.first_cycle), known))
         self._changed()
         return remaining
 
     def detach(self, variables: Variables) -> gtsam.GaussianFactorGraph:
         """Remove the newest link and return it as a graph, linearized at the refreshed variables.
 
-        Its anchors become variables again. The `shared` factors of `attach` are taken out.
+        Its anchors become variables again.
         """
         known, link = self._with_poses(variables), self.links.pop()
-        graph = graph_of(link.factor.factor(known), *(one.factor(known).negate() for one in link.shared))
+        graph = graph_of(link.factor.factor(known))
         for key in link.leaving.keys[are_poses(link.leaving.keys)].tolist():
             if key != ORIGIN_KEY:
                 variables.insert(np.array([key]), self.poses[key])
@@ -365,7 +352,7 @@ class InactiveChain(InactiveMap):
     # --- as one Gaussian ---------------------------------------------------------------------------------
 
     def joint(self, prior: gtsam.GaussianFactorGraph, variables: Variables) -> gtsam.GaussianFactorGraph:
-        """Return the prior of all variables and anchors, with `shared` factors, at the refreshed values."""
+        """Return the prior of all variables and anchors, at the refreshed values."""
         known = self._with_poses(variables)
         return graph_of(prior, *(link.factor.factor(known) for link in self.links))
 
@@ -407,7 +394,6 @@ def on_origin(graph: gtsam.GaussianFactorGraph, variables: Variables) -> gtsam.G
 def new_link(
     conditional: gtsam.GaussianConditional,
     leaving: IntArray,
-    shared: Sequence[gtsam.GaussianFactor],
     frame: int,
     variables: Variables,
 ) -> Link:
@@ -426,12 +412,11 @@ def new_link(
     solved = np.linalg.solve(
         root[:, keys.entries(own.keys)], np.column_stack([-root[:, keys.entries(others.keys)], right])
     )
-    weak = tuple(relative_factor(graph_of(one), frame, pose, reference, variables) for one in shared)
     gain = np.asarray(solved[:, :-1], float)
     offset = factor.local[keys.entries(own.keys)] - gain @ factor.local[keys.entries(others.keys)]
     offset += solved[:, -1]
     noise = np.asarray(np.linalg.inv(root[:, keys.entries(own.keys)]), float)
-    return Link(factor, weak, own, others, gain, offset, noise)
+    return Link(factor, own, others, gain, offset, noise)
 
 
 def pose_and_reference(key: int, variables: Variables) -> tuple[Array, Array]:

@@ -214,7 +214,7 @@ class FixedLagSmoother(Generic[M_co]):
         held = self.chain.hold(self.variables) if self.chain is not None else []
         graph = graph_of(self.prior, *user, *held) if user or held else self.prior
         change = self.variables.change(entries)
-        hessian, negative_gradient = newton_system(graph, self.window.stores, layout, change)
+        hessian, negative_gradient = newton_system(graph, [self.window.measured], layout, change)
         if sigma_step is not None:
             points = np.arange(layout.block(SENSOR_LETTER).stop, layout.block(POSE_LETTER).start)
             hessian[points, points] += sigma_step**-2
@@ -228,12 +228,12 @@ class FixedLagSmoother(Generic[M_co]):
         """
         if not whole:
             prior = self.absolute_prior()
-        elif self.chain is not None:  # its links hold the weak priors of the inactive part
+        elif self.chain is not None:
             prior = self.chain.joint(self.prior, self.variables)
         else:
             prior = self.inactive.joint_prior(self.prior)
-        fresh = self.window.fresh(self.cycles, whole and self.chain is None)
-        return graph_of(prior, *fresh, *self.user_factors.linearized(self.variables, whole))
+        fresh = self.window.fresh(self.cycles)
+        return graph_of(prior, *fresh, *self.user_factors.linearized(self.variables))
 
     def absolute_prior(self) -> gtsam.GaussianFactorGraph:
         """Return the prior of the active variables in the map frame; the inactive ones must be up to date."""
@@ -310,13 +310,12 @@ class FixedLagSmoother(Generic[M_co]):
         """Deactivate active map points (k,) on which the window has no factor."""
         if len(keys) == 0:
             return
-        shared = [*self.window.weak_on(keys), *self.user_factors.deactivate(keys, self.variables)]
-        user = self.user_factors.remove(keys, self.variables)
+        prior = graph_of(self.prior, *self.user_factors.remove(keys, self.variables))
         keyframes = self.variables.keyframes
         if self.chain is not None:
-            self.prior = self.chain.attach(self.prior, keys, shared, self.variables)
+            self.prior = self.chain.attach(prior, keys, self.variables)
         else:
-            self.prior = self.inactive.push(graph_of(self.prior, *user), keys, keyframes, shared)
+            self.prior = self.inactive.push(prior, keys, keyframes)
         self.variables.remove(keyframes)
         self.window.drop(self.inactive.keys)  # a factor linearized earlier may still hold one of them
 
@@ -355,7 +354,6 @@ class FixedLagSmoother(Generic[M_co]):
         else:
             self.prior = self.inactive.joint_prior(self.prior)
         self.inactive = InactiveMap()
-        self.user_factors.reactivate()
         keyframes = self.variables.keyframes
         self.prior = marginalize(self.prior, keyframes)
         self.variables.remove(keyframes)
@@ -437,7 +435,6 @@ def restart(smoother: Smoother, first_cycle: int) -> None:
     A new prior must be set, on all that remains.
     """
     smoother.transform_to_origin()
-    smoother.user_factors.reactivate()
     smoother.map.activate_all()
     smoother.inactive = InactiveMap()
     smoother.held, smoother.prior = None, gtsam.GaussianFactorGraph()

@@ -20,7 +20,7 @@ from pathspace_graph.factors.odometry import IntegratedOdometry
 
 from .elimination import owners
 from .gaussian import graph_of, jacobian_factor, normal_equations, square_root_form
-from .rows import OdometryChain, Rows, among, at_reference, factor_of_block, jacobian_factors, stacked_factor
+from .rows import OdometryChain, Rows, among, at_reference, factor_of_block, jacobian_factors
 from .variables import (
     CALIBRATION_LETTER,
     NO_KEYS,
@@ -64,10 +64,6 @@ class MapRows(Protocol):
     reached_inactive: bool
     """Whether a row of the last call of `rows` should be on an inactive map point, but is not."""
 
-    @property
-    def structure(self) -> object:
-        """Return an object that is another one once the weak priors have other variables."""
-
     def changed(self) -> IntArray:
         """Return the cycles (k,) whose detections in use have changed since the last linearization."""
 
@@ -79,12 +75,6 @@ class MapRows(Protocol):
 
     def linearized(self, cycles: IntArray) -> None:
         """Note that the graph now holds the rows that were returned last, which are of these cycles."""
-
-    def gauge(self, whole: bool) -> list[Rows]:
-        """Return the nonlinear weak priors on the active map points, or on all if `whole`."""
-
-    def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Return the linear weak priors, which are made again only when `structure` changes."""
 
     def activate(self, keys: IntArray) -> None:
         """Make some map points active, which lie next to the active ones."""
@@ -110,42 +100,26 @@ class WindowFactors(Generic[M_co]):
         self.odometry = OdometryChain()  # between each pose of the window and the next
         self.exact = False  # whether the tolerances are zero
         self._lengthened = -1  # the rows of this cycle lack the odometry that leads on from it
-        self.measured = RowStore()  # of detections, and of the odometry to the next cycle, by cycle
-        self.gauge = RowStore()  # nonlinear weak priors
-        self.linear_gauge = RowStore()
+        self.measured = RowStore()
+        """Rows `J d + r` of map and odometry by cycle, with d = value - reference."""
         self._tolerances = tolerances
-        self._structure: object = None
 
     def copy(self) -> Self:
         """Return factors that can be linearized independently; the map is left to the owner of both."""
         other = shallow(self)
         other.odometry, other.measured = shallow(self.odometry), self.measured.copy()
-        other.gauge, other.linear_gauge = self.gauge.copy(), self.linear_gauge.copy()
         return other
 
-    @property
-    def stores(self) -> tuple[RowStore, RowStore, RowStore]:
-        """Return all rows as they were linearized last, `J d + r` with d = value - reference."""
-        return self.measured, self.gauge, self.linear_gauge
-
     def fresh_rows(self, cycles: IntArray) -> RowStore:
-        """Return the rows of some cycles and the weak priors on the active map points, linearized now."""
+        """Return the rows of some cycles, linearized now."""
         fresh = RowStore()
-        self._put(fresh, NO_KEYS, [*self._rows(cycles), *self._weak(False)])
+        self._put(fresh, NO_KEYS, self._rows(cycles))
         return fresh
 
-    def fresh(self, cycles: IntArray, whole: bool) -> list[gtsam.GaussianFactor]:
-        """Return factors of some cycles and weak priors, on all points if `whole`, linearized now."""
+    def fresh(self, cycles: IntArray) -> list[gtsam.GaussianFactor]:
+        """Return factors of some cycles, linearized now."""
         measured = at_reference(self._rows(cycles), self.variables)
-        factors = jacobian_factors(measured, self.variables.layout)
-        return [*factors.values(), *stacked_factor(self._weak(whole), self.variables)]
-
-    def weak_on(self, keys: IntArray) -> list[gtsam.GaussianFactor]:
-        """Return the weak priors that hold any of some active map points (k,), as one factor."""
-        touching = [
-            rows.where(np.asarray(np.isin(rows.keys, keys).any(axis=1))) for rows in self._weak(False)
-        ]
-        return [*stacked_factor(touching, self.variables)]
+        return [*jacobian_factors(measured, self.variables.layout).values()]
 
     def relinearize(self, cycles: IntArray, inactive: IntArray) -> bool:
         """Linearize stale rows again; false, and nothing changes, if one would hold an inactive key (k,)."""
@@ -157,7 +131,6 @@ class WindowFactors(Generic[M_co]):
         self._put(self.measured, stale, groups)
         self._lengthened = -1
         self.map.linearized(stale)
-        self._relinearize_gauge(moved)
         entries = self.variables.layout.entries(moved)
         self.variables.linearized[entries] = self.variables.values[entries]
         return True
@@ -178,7 +151,7 @@ class WindowFactors(Generic[M_co]):
 
     def clear(self) -> None:
         """Drop every row, since the map has other variables."""
-        self.measured, self._structure = RowStore(), None
+        self.measured = RowStore()
 
     def _put(self, store: RowStore, owners: IntArray, groups: Sequence[Rows]) -> None:
         """Replace all rows of some ascending owners by rows that are linearized at the values."""
@@ -187,9 +160,6 @@ class WindowFactors(Generic[M_co]):
 
     def _rows(self, cycles: IntArray) -> list[Rows]:
         return [*self.map.rows(cycles), *self.odometry.rows(self.variables, cycles)]
-
-    def _weak(self, whole: bool) -> list[Rows]:
-        return [*self.map.gauge(whole), *self.map.linear_gauge(whole)]
 
     def _moved(self) -> IntArray:
         """Return the keys of variables that moved by more than the tolerance since their linearization.
@@ -213,26 +183,12 @@ class WindowFactors(Generic[M_co]):
         stale |= among(cycles, np.sort(self.map.changed()))
         return np.asarray(cycles[stale])
 
-    def _relinearize_gauge(self, moved: IntArray) -> None:
-        if self.map.structure is not self._structure:
-            self.gauge, self.linear_gauge, self._structure = RowStore(), RowStore(), self.map.structure
-            self._put(self.linear_gauge, NO_KEYS, self.map.linear_gauge(False))
-        if (self.exact and len(moved)) or not self.gauge:
-            self.gauge = RowStore()
-            self._put(self.gauge, NO_KEYS, self.map.gauge(False))
-            return
-        stale = np.unique(self.gauge.holding(moved))
-        if len(stale):
-            weak = [rows.where(among(rows.owner, stale)) for rows in self.map.gauge(False)]
-            self._put(self.gauge, stale, weak)
-
 
 class UserFactors:
-    """User's factors, which stay nonlinear until one of their variables is eliminated."""
+    """User's factors, which stay nonlinear until one of their variables is eliminated or becomes inactive."""
 
     def __init__(self) -> None:
-        self.factors: list[gtsam.NonlinearFactor] = []  # active ones
-        self._inactive: list[gtsam.NonlinearFactor] = []
+        self.factors: list[gtsam.NonlinearFactor] = []
         self.given = False  # whether the user has ever given a factor, which may be absolute
 
     def add(self, factors: Sequence[gtsam.NonlinearFactor]) -> None:
@@ -242,43 +198,22 @@ class UserFactors:
 
     @property
     def keys(self) -> IntArray:
-        """Return the keys (k,) of all active factors; a key may occur several times."""
+        """Return the keys (k,) of all factors; a key may occur several times."""
         return np.concatenate([NO_KEYS, *map(keys_of_factor, self.factors)])
 
-    @property
-    def count(self) -> int:
-        return len(self.factors) + len(self._inactive)
-
-    def linearized(self, variables: Variables, whole: bool = False) -> list[gtsam.GaussianFactor]:
-        """Return the active factors, and the inactive ones too if `whole`, linearized at the values."""
-        return _linear(self.factors + self._inactive if whole else self.factors, variables)
+    def linearized(self, variables: Variables) -> list[gtsam.GaussianFactor]:
+        """Return the factors, linearized at the values."""
+        return _linear(self.factors, variables)
 
     def remove(self, keys: IntArray, variables: Variables) -> list[gtsam.GaussianFactor]:
         """Remove every factor that holds one of these variables (k,), and return them linearized."""
-        return _linear(self._taken(keys), variables)
+        taken = [one for one in self.factors if np.isin(keys_of_factor(one), keys).any()]
+        self.factors = [one for one in self.factors if one not in taken]
+        return _linear(taken, variables)
 
     def drop(self, factors: Sequence[gtsam.NonlinearFactor | None]) -> None:
-        """Drop some of the active factors, which another prior includes."""
+        """Drop some of the factors, which another prior includes."""
         self.factors = [one for one in self.factors if one not in factors]
-
-    def deactivate(self, keys: IntArray, variables: Variables) -> list[gtsam.GaussianFactor]:
-        """Deactivate factors on one of the map points (k,) and on no pose, and return them linearized."""
-        inactive = self._taken(keys, with_poses=False)
-        self._inactive = [*self._inactive, *inactive]
-        return _linear(inactive, variables)
-
-    def reactivate(self) -> None:
-        self.factors, self._inactive = self.factors + self._inactive, []
-
-    def _taken(self, keys: IntArray, with_poses: bool = True) -> list[gtsam.NonlinearFactor]:
-        """Take out the active factors on one of these variables (k,), and on no pose unless `with_poses`."""
-        taken = [
-            one
-            for one in self.factors
-            if np.isin(held := keys_of_factor(one), keys).any() and (with_poses or not are_poses(held).any())
-        ]
-        self.factors = [one for one in self.factors if one not in taken]
-        return taken
 
 
 def user_rows(factors: Sequence[gtsam.NonlinearFactor], variables: Variables) -> list[Rows]:

@@ -42,7 +42,6 @@ class NewMap:
     information: Array  # (n, n) inverse of its covariance
     scatter: dict[int, Array] = field(default_factory=dict)  # as in `CurveMap.replaced_by`
     cones: dict[int, Array] = field(default_factory=dict)
-    held_by_prior: bool = False  # whether the prior includes the weak priors of spacing and shape
 
 
 def replace_map(
@@ -69,7 +68,9 @@ def replace_map(
         variables.insert(state.control_keys(label), points.ravel())
     variables.calibrations[:] = new.calibration
     state.poses[:] = poses
-    smoother.map.replaced_by(new.scatter, new.cones, new.held_by_prior)
+    smoother.map.replaced_by(new.scatter, new.cones)
+    for label, count in new.known.items():
+        smoother.map.place(label, count)
     if are_new:
         locate_poses(state)
         if not state.closed:
@@ -80,6 +81,9 @@ def replace_map(
     if are_new:
         later = [one for one in given if one.cycle >= smoother.first_cycle and one.points]
         smoother.add_to_prior([rows for one in later for rows in one.on(state)])
+    if state.closed:
+        smoother.deactivate_distant()  # most of a long map: the window does not reach it
+    if are_new:
         smoother.reassociate()
     for _ in range(road.settings.closing.iterations):
         smoother.step(SIGMA_STEP)
@@ -102,7 +106,7 @@ def take_marginal(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor
     curves = dict[int, tuple[Boundary, Array]]()
     for label, spline in marginal.splines.items():
         points = spline.distinct_control_points
-        boundary = state.boundaries.get(label, open_boundary(settings.spline, settings.gauge))
+        boundary = state.boundaries.get(label, open_boundary(settings.spline))
         if spline.periodic:  # a batch may have found a side that the road has not
             curves[label] = boundary.closed(spline.knots), points
             continue
@@ -119,7 +123,6 @@ def take_marginal(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor
         marginal.information,
         marginal.scatter,
         marginal.cones,
-        held_by_prior=marginal.closed,
     )
     jump = replace_map(road, new, poses, marginal.first_kept, given)
     exchange_calibration_priors(smoother, marginal.calibration_prior)
@@ -129,7 +132,7 @@ def take_marginal(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor
 def take_known(road: Road, known: KnownMap, pose: Array, covariance: Array) -> Array:
     """Continue on a known map; return the jump (3,) of the newest pose, which was `pose` (3,) on that map.
 
-    The covariance (3, 3) is of the newest pose, map frame. The map keeps the weak priors where it grows.
+    The covariance (3, 3) is of the newest pose, map frame.
     """
     road.smoother.transform_to_origin()
     settings, state, boundaries = road.settings, road.smoother.map.state, road.boundaries
@@ -148,7 +151,6 @@ def take_known(road: Road, known: KnownMap, pose: Array, covariance: Array) -> A
         np.concatenate([state.variables.calibrations, *(own.ravel() for own in points), pose]),
         block_diag(*map(np.linalg.inv, parts)),
         cones=known.cones,
-        held_by_prior=known.closed,
     )
     road.growth.wait_for({} if known.closed else known.ends)
     poses = compose(compose(pose, inverse(road.poses[-1])), road.poses)

@@ -1,4 +1,4 @@
-"""The curves for the engine: rows of detections (paper: Update) and of weak priors, on keys."""
+"""The curves for the engine: rows of detections (paper: Update) and of new control points, on keys."""
 
 from collections.abc import Callable
 from typing import Final, Self
@@ -9,28 +9,31 @@ from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import huber_weights
-from pathspace_graph.factors.residuals import pair_residuals
-from pathspace_graph.graph.rows import Rows, stacked_rows
-from pathspace_graph.graph.variables import FIRST_POSE, SENSOR_KEY, control_keys
+from pathspace_graph.graph.rows import Rows, among
+from pathspace_graph.graph.variables import FIRST_POSE, NO_KEYS, SENSOR_KEY
 from pathspace_graph.io.map import NO_CONES
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .detection_rows import Stations
 from .detections import NO_STATION, DetectionTable
-from .state import State, factor_numbers
+from .state import State
+from .weak_priors import WeakPriors
 
 SIGHTINGS_IN_WINDOW: Final = 20.0  # typical number of a cone's detections in a window
 
 
 class CurveMap:
-    """Both boundaries with the detections of the window's poses, and the rows of both."""
+    """Both boundaries with what the window's poses have seen and placed, and the rows of these."""
 
     def __init__(self, settings: MapperSettings, state: State | None = None) -> None:
         self.settings = settings
         self.state = state or State()  # curves and all variables
         self.variables = self.state.variables
         self.detections = DetectionTable()  # detections of the poses in the window
-        self.held_by_prior = False  # whether the prior determines the curves' spacing and shape
+        self.weak: dict[
+            int, WeakPriors
+        ] = {}  # of the control points placed beside poses of the window, by label
+        self._replaced = NO_KEYS  # cycles whose weak priors have changed since the last linearization
         self.scatter: dict[int, Array] = {}  # (m,) sigma of cones at each control point, if known (m)
         self.cones: dict[int, Array] = {}  # (k, 2) cones of a boundary, if known: parameters, and sigmas (m)
         self.stations: Stations | None = None  # these cones, if they constrain detections along the curves
@@ -48,14 +51,15 @@ class CurveMap:
     # --- detections --------------------------------------------------------------------------------------
 
     def changed(self) -> IntArray:
-        """Cycles (k,) of associations that have changed since the last linearization."""
-        return self.detections.cycle[self.detections.changed]
+        """Cycles (k,) of associations and weak priors that have changed since the last linearization."""
+        return np.append(self.detections.cycle[self.detections.changed], self._replaced)
 
     def rows(self, cycles: IntArray) -> list[Rows]:
         """Linearize `w_i n_i . (R z_i + t - S(u_i)) / sigma_i` for the used detections of ascending cycles.
 
         The keys are [pose | control points of the span]; w is the root of the Huber weight, and zero if the
-        foot point is not interior. `linearized` stores the refined parameters u.
+        foot point is not interior. `linearized` stores the refined parameters u. The weak priors of the
+        cycles follow.
         """
         state, detections = self.state, self.detections
         if not state.boundaries or len(cycles) == 0:
@@ -73,7 +77,8 @@ class CurveMap:
             (FIRST_POSE, SENSOR_KEY),
         )
         self._refined = rows, u
-        return [Rows(*parts), *self._along(rows)]
+        weak = (one.where(among(one.cycle, cycles)) for one in self.weak.values())
+        return [Rows(*parts), *self._along(rows), *(own for one in weak for own in one.rows(variables))]
 
     def _along(self, rows: IntArray) -> list[Rows]:
         """Linearize `w t . (R z + t - S(u)) / sigma` for the detections (m,) with a station u."""
@@ -93,6 +98,7 @@ class CurveMap:
         if len(cycles) and self.state.boundaries:
             self.detections.refine(*self._refined)
             self.detections.mark_linearized()
+            self._replaced = NO_KEYS
 
     def activate(self, keys: IntArray) -> None:
         """Activate control points that are next to the active ones."""
@@ -110,15 +116,16 @@ class CurveMap:
         """Remove the detections of the oldest pose, which has left the window."""
         self.detections.keep_from(cycle + 1)
         self.state.drop_oldest_pose_u()
+        self.weak = {
+            label: one.where(one.cycle > cycle) for label, one in self.weak.items() if len(one.cycle)
+        }
 
-    def replaced_by(
-        self, scatter: dict[int, Array], cones: dict[int, Array], held_by_prior: bool = True
-    ) -> None:
+    def replaced_by(self, scatter: dict[int, Array], cones: dict[int, Array]) -> None:
         """Take over the scatter and the cones, by label, from the batch that made curves and prior.
 
         Cones (k, 2) are their parameters and standard deviations along the curves (m).
         """
-        self.held_by_prior, self.scatter, self.cones = held_by_prior, scatter, cones
+        self.scatter, self.cones, self.weak = scatter, cones, {}
         self.lay_out_stations()
 
     def lay_out_stations(self) -> None:
@@ -135,48 +142,20 @@ class CurveMap:
 
     # --- weak priors -------------------------------------------------------------------------------------
 
-    @property
-    def structure(self) -> object:
-        """Token whose identity changes with the control points that have weak priors."""
-        return self.state.curves.keys if self.state.boundaries else None
+    def place(self, label: int, first: int) -> None:
+        """Keep the control points from index `first` on where they are, as seen from the newest pose.
 
-    def gauge(self, whole: bool) -> list[Rows]:
-        """Linearize `(|c_{j+1} - c_j| - nominal_j) / (sigma_spacing nominal_j)`, on all points if `whole`."""
-        if not self.state.boundaries or self.held_by_prior:
-            return []
-        pairs, nominal, keys, owner = (self.state.whole_curves if whole else self.state.curves).pairs
-        points, sigma = self.state.map_points, self.settings.gauge.sigma_spacing * nominal
-        off, direction = pair_residuals(points[pairs[:, 0]], points[pairs[:, 1]], nominal)
-        jacobian = np.concatenate([-direction, direction], axis=1) / sigma[:, None]
-        return [Rows(keys, jacobian, off / sigma, owner)]
-
-    def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Rows of smoothness `D c / (sigma_smoothness spacing)` and anchors, on all points if `whole`.
-
-        An anchor is a prior of a control point at its present position, so weak that it only keeps the system
-        regular.
+        These weak priors replace any that they have had.
         """
-        smooth, anchors = [], []
-        for label, boundary in self.state.boundaries.items():
-            gauge = boundary.gauge_on(boundary.everything if whole else self.state.active(label))
-            if not self.held_by_prior:
-                points = self.state.control_points(label)[gauge.triples]
-                bent = (gauge.bending[:, :, None] * points).sum(axis=1)
-                smooth.append(self._rows(label, gauge.triples, _by_axis(gauge.bending), bent.ravel()))
-            active = gauge.points[:, None]
-            held = np.tile(np.eye(2) / self.settings.gauge.sigma_anchor, (len(active), 1))
-            anchors.append(self._rows(label, active, held, np.zeros(len(held))))
-        return [stacked_rows(groups) for groups in (smooth, anchors) if groups]
-
-    def _rows(self, label: int, points: IntArray, jacobian: Array, residual: Array) -> Rows:
-        """Build rows, equally many for each row of `points` (m, k); neighbouring points share an owner."""
-        repeated = np.repeat(points, len(residual) // max(len(points), 1), axis=0)
-        keys = control_keys(label, self.state.boundaries[label].first + repeated)
-        return Rows(keys, jacobian, residual, factor_numbers(repeated[:, 0], label))
-
-
-def _by_axis(coefficients: Array) -> Array:
-    """Expand coefficients (m, k) of k points to (2 m, 2 k), once for x and once for y."""
-    both = np.zeros((len(coefficients), 2, coefficients.shape[1], 2))
-    both[:, 0, :, 0] = both[:, 1, :, 1] = coefficients
-    return both.reshape(2 * len(coefficients), 2 * coefficients.shape[1])
+        points = np.arange(first, self.state.boundaries[label].size)
+        if len(points) == 0:
+            return
+        newest = self.variables.first_cycle + len(self.variables.poses) - 1
+        new = WeakPriors.of(self.state, label, points, np.full(len(points), newest), self.settings.gauge)
+        self._replaced = np.append(self._replaced, newest)
+        known = self.weak.get(label)
+        if known is not None:
+            gone = known.keys >= new.keys[0]
+            self._replaced = np.concatenate([self._replaced, known.cycle[gone]])
+            new = known.where(~gone).joined(new)
+        self.weak = {**self.weak, label: new}

@@ -76,8 +76,9 @@ class Growth(Copyable):
         if len(found.points) < 2:
             return
         u = path_lengths(found.points)
-        boundary, state = open_boundary(track.settings.spline, track.settings.gauge), track.state
+        boundary, state = open_boundary(track.settings.spline), track.state
         state.add_boundary(label, boundary, boundary.grow(np.zeros((0, 2)), u, found.points))
+        track.place(label, 0)
         self._consume(track, label, found, u)
         state.locate(label, np.zeros(len(state.poses)))
         _relocate_poses(state, label, 0.0)
@@ -89,8 +90,9 @@ class Growth(Copyable):
         if kept == len(boundary.observed):
             return self._extend(track, label, path_ahead, path.END_BEHIND)
         self._take_back(smoother, label, kept)
-        from_u = boundary.confirmed_end
+        from_u, first = boundary.confirmed_end, boundary.settled(boundary.size)
         self._extend(track, label, path_ahead, RECALL)
+        track.place(label, first)
         _relocate_poses(track.state, label, from_u)
         return True
 
@@ -103,14 +105,14 @@ class Growth(Copyable):
         found = self._candidates(track, label, path_ahead, end)
         room = self.settings.max_unseen - track.state.boundaries[label].unseen
         if len(found.points) and np.hypot(*(found.points[0] - end.position)) < room:
-            u = _extend_through(track.state, label, end.position, found.points)
+            u = _extend_through(track, label, end.position, found.points)
             self._consume(track, label, found, u)
             return True
         if end.station < path_ahead.driven - path.STRANDED:
-            return self._follow_path(track.state, label, path_ahead, end, room)
+            return self._follow_path(track, label, path_ahead, end, room)
         return False
 
-    def _follow_path(self, state: State, label: int, path_ahead: PathAhead, end: End, room: float) -> bool:
+    def _follow_path(self, track: CurveMap, label: int, path_ahead: PathAhead, end: End, room: float) -> bool:
         """Extrapolate a passed end, at its distance from the path; return whether the curve has grown."""
         side = max(end.side, path.MIN_LATERAL)
         point = path_ahead.beside(path_ahead.driven - path.CARRIED_TO, SIDES[label] * side)
@@ -119,7 +121,7 @@ class Growth(Copyable):
             self._full |= {label}
         if not path.MIN_CARRY <= distance <= room:
             return False
-        _extend_through(state, label, end.position, point[None])
+        _extend_through(track, label, end.position, point[None])
         return True
 
     def _take_back(self, smoother: CurveSmoother, label: int, kept: int) -> None:
@@ -186,14 +188,17 @@ class Growth(Copyable):
         return is_full
 
 
-def _extend_through(state: State, label: int, end: Array, points: Array) -> Array:
+def _extend_through(track: CurveMap, label: int, end: Array, points: Array) -> Array:
     """Extend a curve from its end (2,) through points (k, 2); return their parameters (k,)."""
+    state = track.state
     boundary, known = state.boundaries[label], state.control_points(label)
+    first = boundary.settled(len(known), boundary.last_cone(boundary.confirmed_end))
     u = boundary.confirmed_end + path_lengths(np.concatenate([end[None], points]))[1:]
     control_points = boundary.grow(known.copy(), u, points)
     known[:] = control_points[: len(known)]
     if len(control_points) > len(known):
         state.extend(label, control_points[len(known) :])
+    track.place(label, first)
     return np.asarray(u)
 
 

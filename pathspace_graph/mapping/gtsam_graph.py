@@ -1,5 +1,6 @@
 """The factors of curves in GTSAM's own classes, for the graphs of window and batch."""
 
+from collections.abc import MutableSequence
 from typing import Any
 
 import gtsam
@@ -7,22 +8,24 @@ import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.gtsam_factors import (
+    fill,
     smoothness_factors,
     spline_projection_factors,
     station_factors,
 )
-from pathspace_graph.graph.variables import POINT, pose_keys
+from pathspace_graph.graph.variables import POINT, pose_key, pose_keys
 from pathspace_graph.spline.boundary import Boundary
 
 from .curve_map import CurveMap
 from .detections import NO_STATION
+from .weak_priors import WeakPriors
 
 
-def curve_factors(track: CurveMap, label: int, spacing: bool = True) -> list[gtsam.NonlinearFactor]:
-    """Return the factors of the detections in use on a boundary, and the weak priors of its active points.
+def curve_factors(track: CurveMap, label: int) -> list[gtsam.NonlinearFactor]:
+    """Return the factors of the detections in use on a boundary, and the weak priors of its control points.
 
     A detection has a factor across the curve, and one at its station, with their Huber losses. Foot points
-    may move as far as in a step, within the active part of the curve. A batch has no prior of spacing.
+    may move as far as in a step, within the active part of the curve.
     """
     detections, settings, state = track.detections, track.settings, track.state
     boundary, active, rows = state.boundaries[label], state.active(label), detections.used_on(label)
@@ -54,23 +57,31 @@ def curve_factors(track: CurveMap, label: int, spacing: bool = True) -> list[gts
         station = detections.station[rows]
         at, sigma_station = track.stations.u[station], track.stations.sigma[station]
         factors += station_factors(u=at, sigma_station=sigma_station, **seen(rows))
-    return factors + _weak_priors(track, label, active, spacing)
+    weak = track.weak.get(label)
+    if weak is not None:
+        factors += [factor_beside(weak, j) for j in range(len(weak.keys))]
+        for triple, bending in zip(weak.triples.tolist(), weak.bending, strict=True):
+            factors += smoothness_factors(triple, bending[None], 1.0) if bending.any() else []
+    return factors
 
 
-def _weak_priors(track: CurveMap, label: int, active: IntArray, spacing: bool) -> list[gtsam.NonlinearFactor]:
-    """Return spacing and smoothness, unless the map's prior has them, and the anchors of control points."""
-    state, boundary = track.state, track.state.boundaries[label]
-    keys, gauge, factors = state.control_keys(label), boundary.gauge_on(active), list[gtsam.NonlinearFactor]()
-    if not track.held_by_prior:
-        pairs = zip(keys[gauge.pairs].tolist(), gauge.nominal.tolist(), strict=True)
-        for (key, following), nominal in pairs if spacing else ():
-            noise = gtsam.noiseModel.Isotropic.Sigma(1, track.settings.gauge.sigma_spacing * nominal)
-            factors.append(gtsam.RangeFactor2(key, following, nominal, noise))
-        for triple, bending in zip(keys[gauge.triples].tolist(), gauge.bending, strict=True):
-            factors += smoothness_factors(triple, bending[None], 1.0)
-    anchor = gtsam.noiseModel.Isotropic.Sigma(POINT, boundary.gauge.sigma_anchor)
-    points = zip(keys[active].tolist(), state.control_points(label)[active], strict=True)
-    return factors + [gtsam.PriorFactorPoint2(*own, anchor) for own in points]
+def factor_beside(one: WeakPriors, j: int) -> gtsam.CustomFactor:
+    """Build the factor that keeps a control point where it is, as seen from its pose."""
+    point_key, cycle = int(one.keys[j]), int(one.cycle[j])
+    place, whitener = one.place[j], one.whitener[j]
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, H: MutableSequence[Array] | None) -> Array:
+        pose, by_pose, by_point = (
+            values.atPose2(pose_key(cycle)),
+            np.zeros((2, 3), order="F"),
+            np.zeros((2, 2), order="F"),
+        )
+        seen = pose.transformTo(values.atPoint2(point_key), by_pose, by_point)
+        if H is not None:
+            fill(H, [whitener @ by_point, whitener @ by_pose])
+        return np.asarray(whitener @ (seen - place))
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(POINT), [point_key, pose_key(cycle)], error)
 
 
 def _room(boundary: Boundary, active: IntArray, u: Array, room: float) -> tuple[Array, Array]:

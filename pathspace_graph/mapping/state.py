@@ -35,7 +35,6 @@ from pathspace_graph.graph.window import user_rows
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline
 
-POINTS_PER_FACTOR: Final = 6  # number of consecutive control points whose weak priors form one factor
 SAMPLE: Final = 0.25  # step of the samples of curves that are compared with curves and cones (m)
 SAMPLES_PER_POINT: Final = 3  # points of a curve for each control point that is expressed by them
 NEGLIGIBLE: Final = 1e-6  # share of the largest derivative below which one is left out
@@ -90,22 +89,6 @@ class Curves:
         """Return the same layout with copies of the boundaries."""
         return replace(self, boundaries=tuple(boundaries.values()))
 
-    @cached_property
-    def pairs(self) -> tuple[IntArray, Array, IntArray, IntArray]:
-        """Pairs of neighbouring active control points, by rows (r, 2) of `State.map_points`.
-
-        Their nominal distances (r,) in m, keys (r, 2), and the numbers (r,) of their factors follow.
-        """
-        before, rows, owners, nominal = 0, [], [], []
-        for label, boundary, active in zip(self.labels.tolist(), self.boundaries, self.active, strict=True):
-            gauge = boundary.gauge_on(active)
-            rows.append(before + gauge.pairs)
-            owners.append(factor_numbers(gauge.pairs[:, 0], label))
-            nominal.append(gauge.nominal)
-            before += boundary.size
-        pairs = np.concatenate(rows)
-        return pairs, np.concatenate(nominal), self.keys[pairs], np.concatenate(owners)
-
     @property
     def trusted(self) -> Array:
         """Parameter (k,) of each curve up to which foot points are allowed."""
@@ -141,7 +124,6 @@ class State:
         self.drives = drives  # drives of the poses
         self.pose_u: dict[int, Array] = {}  # (P,) parameters of the poses, increasing from lap to lap
         self._curves: Curves | None = None
-        self._whole_curves: Curves | None = None
 
     def copy(self) -> Self:
         """Return an independent copy."""
@@ -151,7 +133,6 @@ class State:
         other.pose_u = self.pose_u.copy()
         other.active_stretch = self.active_stretch.copy()
         other._curves = self._curves and self._curves.on(other.boundaries)
-        other._whole_curves = self._whole_curves and self._whole_curves.on(other.boundaries)
         return other
 
     def control_keys(self, label: int) -> IntArray:
@@ -207,17 +188,6 @@ class State:
         if known is None or not known.is_of(self.boundaries, self.active_stretch):
             active = {label: self.active(label) for label in self.boundaries}
             known = self._curves = Curves.of(self.boundaries, active)
-        return known
-
-    @property
-    def whole_curves(self) -> Curves:
-        """Layout of the boundaries with all control points; cached."""
-        if self.whole:
-            return self.curves
-        known = self._whole_curves
-        if known is None or not known.is_of(self.boundaries, {}):
-            everything = {label: boundary.everything for label, boundary in self.boundaries.items()}
-            known = self._whole_curves = Curves.of(self.boundaries, everything)
         return known
 
     def add_boundary(self, label: int, boundary: Boundary, control_points: Array) -> None:
@@ -277,11 +247,6 @@ class State:
     def drop_oldest_pose_u(self) -> None:
         """Remove the parameters of the oldest pose, which has left the window."""
         self.pose_u = {label: u[1:] for label, u in self.pose_u.items()}
-
-
-def factor_numbers(points: IntArray, label: int) -> IntArray:
-    """Number of the factor with the weak priors of control points (k,), by index."""
-    return np.asarray(len(CONTROL_LETTERS) * (points // POINTS_PER_FACTOR) + label)
 
 
 # --- the user's factors on other curves ------------------------------------------------------------------

@@ -185,6 +185,6 @@ def _row(track: CurveMap, label: int, candidates: Array) -> ConeRow:
 
 def _begun(settings: MapperSettings, row: ConeRow, variances: Array) -> Outlook:
     """Fit an unconfirmed curve through the tracks of a row."""
-    boundary, u = open_boundary(settings.spline, settings.gauge), row.lengths
+    boundary, u = open_boundary(settings.spline), row.lengths
     placement = boundary.extend(0, u - u[0])
     return Outlook(boundary, np.zeros((0, POINT)), 0.0, row.cones, variances, placement)

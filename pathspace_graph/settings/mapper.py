@@ -62,11 +62,11 @@ class GaugeSettings(Checked):
     """The weak priors on what detections leave free."""
 
     sigma_spacing: float = 0.3
-    """Standard deviation of the distance of neighbouring control points, as a share of its nominal value."""
+    """Standard deviation of a control point's slide along its curve, as a share of the spacing."""
     sigma_smoothness: float = 1.0
     """Standard deviation of the second difference of control points, as a share of their spacing."""
 
-    sigma_anchor: ClassVar[float] = 1e4  # of each control point's place, m, which keeps the system regular
+    sigma_anchor: ClassVar[float] = 1e4  # of its place across the curve, m, which keeps the system regular
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,6 @@ class BatchSettings(Checked):
 
     dense_share: ClassVar[float] = 1.0  # control points for each cone of the curves that are solved for
     sigma_model: ClassVar[float] = 0.05  # m, of a cone's distance from these; online they have fewer points
-    sigma_slide: ClassVar[float] = 0.2  # m, of a control point's slide along its curve
     gate: ClassVar[float] = 4.0  # sigmas of a detection from its curve, beyond which it is not used
 
 

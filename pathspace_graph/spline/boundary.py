@@ -12,27 +12,16 @@ from pathspace_graph.factors._kernels import Curves
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials, scatter
 from pathspace_graph.factors.footpoint import FootPoints
-from pathspace_graph.factors.residuals import greville, smoothness_coefficients, smoothness_matrix
+from pathspace_graph.factors.residuals import greville, smoothness_matrix
 from pathspace_graph.factors.se2 import move_points, path_lengths
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
-from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
+from pathspace_graph.settings.mapper import SplineSettings
 
 from .bspline import BSpline, cross, dot, segments_cross, side_of
 
 KNOT_ROUND_OFF = 1e-9  # tolerance of a parameter that lies on a knot (m)
 
 SAME_DIRECTION = 0.5  # least cosine of the angle between a curve and the heading of a vehicle beside it
-
-
-@dataclass(frozen=True, eq=False)
-class Gauge:
-    """Spacing and smoothness priors of a stretch of control points, by their indices."""
-
-    points: IntArray  # (k,) control points in driving order
-    pairs: IntArray  # (r, 2) neighbouring control points
-    nominal: Array  # (r,) nominal distance of each pair (m)
-    triples: IntArray  # (t, 3) three consecutive control points
-    bending: Array  # (t, 3) coefficients of a triple's second difference, in sigmas (1/m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +51,9 @@ class Boundary:
     first cone.
     """
 
-    def __init__(
-        self, knots: Array, periodic: bool, settings: SplineSettings, gauge: GaugeSettings, first: int = 0
-    ) -> None:
+    def __init__(self, knots: Array, periodic: bool, settings: SplineSettings, first: int = 0) -> None:
         self.first = first  # number of the first control point's key; new knots get new numbers
-        self.settings, self.gauge = settings, gauge
+        self.settings = settings
         self.degree, self.periodic = settings.degree, periodic
         self.confirmed_end = 0.0  # parameter up to which cones support the curve (m)
         self.observed: Array = np.zeros((0, 2))  # (n, 2) cones it was grown through, map frame (m)
@@ -83,26 +70,6 @@ class Boundary:
             following = np.append(following, self.abscissae[0] + self.length)
         self.nominal = following - self.abscissae[: len(following)]  # (m,) distances of neighbours (m)
         self.everything = np.arange(self.size)
-        self._gauge: Gauge | None = None
-
-    def gauge_on(self, points: IntArray) -> Gauge:
-        """Return the priors between control points (k,) in driving order; the latest result is cached."""
-        if self._gauge is not None and self._gauge.points is points:
-            return self._gauge
-        whole = self.periodic and len(points) == self.size
-        abscissae = self.abscissae[points]
-        abscissae = abscissae + self.length * (abscissae < abscissae[:1])  # unwrap a stretch past the seam
-        spacing = float(np.mean(self.nominal))
-        bending = smoothness_coefficients(abscissae, self.length if whole else None, spacing)
-        first = points if whole else points[:-1]
-        self._gauge = Gauge(
-            points=points,
-            pairs=np.stack([first, (first + 1) % self.size], axis=1),
-            nominal=self.nominal[first],
-            triples=(points[: len(bending), None] + np.arange(3)) % self.size,
-            bending=bending / (self.gauge.sigma_smoothness * spacing),
-        )
-        return self._gauge
 
     @property
     def numbers(self) -> IntArray:
@@ -180,7 +147,7 @@ class Boundary:
 
     def closed(self, knots: Array) -> "Boundary":
         """Make a closed boundary on periodic knots. It is confirmed, and its keys are new."""
-        boundary = Boundary(knots, True, self.settings, self.gauge, self.first + self.size)
+        boundary = Boundary(knots, True, self.settings, self.first + self.size)
         boundary.confirmed_end = boundary.tables.high
         return boundary
 
@@ -250,10 +217,10 @@ class Boundary:
         self.observed, self.cone_parameters = self.observed[:kept], self.cone_parameters[:kept]
 
 
-def open_boundary(settings: SplineSettings, gauge: GaugeSettings) -> Boundary:
+def open_boundary(settings: SplineSettings) -> Boundary:
     p = settings.degree
     knots = settings.spacing * np.arange(-p, p + 2, dtype=float)
-    return Boundary(knots, False, settings, gauge)
+    return Boundary(knots, False, settings)
 
 
 def ahead_of(at: Array | float, u: Array, length: float) -> Array:

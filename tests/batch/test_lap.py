@@ -19,7 +19,7 @@ from pathspace_graph.batch.lap import (
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.optimizer import Effort
 from pathspace_graph.batch.start import StartMap
-from pathspace_graph.batch.system import BatchSystem, Evaluation, curve_gauge
+from pathspace_graph.batch.system import BatchSystem, Evaluation, weak_priors
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import judge_log
@@ -91,25 +91,19 @@ def test_the_marginal_and_the_window_are_the_whole_problem() -> None:
     here = np.concatenate([state.variables.calibration, state.map_points.ravel(), state.poses[first]])
     keys = np.concatenate([[CALIBRATION_KEY], state.map_keys, pose_keys(np.array([first]))])
     root = np.linalg.cholesky(information).T
-    groups = [rows for rows in system.rows(at) if len(rows) and not is_slide(rows)]
+    weak = weak_priors(state, system.gauge, first)
+    groups = [rows for rows in system.rows(at, weak) if len(rows)]
     window = [rows.where(are_later(rows, first)) for rows in groups]
     measured = linear_graph(window, state.variables)
     kept = Layout(keys[:-1])
     marginal = jacobian_factor(keys, root, root @ (mean - here))
     found, vector = eliminated_system(graph_of(marginal, measured), kept)
-    slides = [curve_gauge(state, label, system.sigma_slide, first) for label in state.boundaries]
-    held = [one.rows(state.control_points(one.label), state.poses) for one in slides]
-    early = held + [rows.where(~are_later(rows, first)) for rows in groups]
+    early = [rows.where(~are_later(rows, first)) for rows in groups]
     whole = graph_of(linear_graph(early, state.variables), measured)
     expected, right = eliminated_system(whole, kept)
     scale = np.sqrt(np.diagonal(expected))
     assert found / np.outer(scale, scale) == pytest.approx(expected / np.outer(scale, scale), abs=1e-7)
     assert vector / scale == pytest.approx(right / scale, abs=1e-5)
-
-
-def is_slide(rows: Rows) -> bool:
-    """Returns whether these rows hold a control point beside a pose."""
-    return rows.keys.shape[1] == 2 and not are_poses(rows.keys[0, 0]) and bool(are_poses(rows.keys[0, 1]))
 
 
 def test_the_map_is_as_good_as_that_of_the_batch_over_the_same_log() -> None:

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
-from pathspace_graph.batch.system import Evaluation, factor_beside, nonlinear_graph
+from pathspace_graph.batch.system import Evaluation, nonlinear_graph
 from pathspace_graph.factors.gtsam_factors import pose_array
 from pathspace_graph.factors.noise import huber_loss
 from pathspace_graph.factors.se2 import rotation
@@ -176,22 +176,3 @@ def test_levenberg_marquardt_finds_the_same_optimum() -> None:
     theirs = vector_of(gtsam.LevenbergMarquardtOptimizer(graph, first, parameters).optimize(), begun)
     assert np.abs(theirs - begun.variables.values).max() > 0.05
     np.testing.assert_allclose(theirs, at.state.variables.values, atol=1e-3)
-
-
-def test_a_control_point_beside_its_pose_has_right_jacobians() -> None:
-    gauge = straight()[0].gauges[0]
-    factor = factor_beside(gauge, 3)
-    keys, rng = list(factor.keys()), np.random.default_rng(2)
-    values = gtsam.Values()
-    values.insert(keys[0], rng.normal(size=2))
-    values.insert(keys[1], gtsam.Pose2(*rng.normal(size=3)))
-    A, b = factor.linearize(values).jacobian()
-    h = 1e-6
-    for k in range(5):
-        step = gtsam.VectorValues()
-        step.insert(keys[0], h * np.eye(5)[k, :2])
-        step.insert(keys[1], h * np.eye(5)[k, 2:])
-        moved, back = values.retract(step), values.retract(step.scale(-1.0))
-        slope = (factor.unwhitenedError(moved) - factor.unwhitenedError(back)) / (2.0 * h)
-        np.testing.assert_allclose(A[:, k], slope, atol=1e-5)
-    np.testing.assert_allclose(b, -factor.unwhitenedError(values))

@@ -58,7 +58,8 @@ def test_the_gate_shrinks_by_its_factor_to_its_last_value() -> None:
     optimizer = Optimizer(system, on_round=lambda: gates.append(system.gate))
     _, convergence = optimizer.run(state, Stage(8.0, 12, 1e9))
     expected = [8.0 * GATE_FACTOR**k for k in range(2)] + [BATCH.gate]
-    np.testing.assert_allclose(gates, expected)
+    np.testing.assert_allclose(gates[:3], expected)
+    assert set(gates[3:]) <= {BATCH.gate}
     assert convergence.converged
     assert convergence.rounds == len(gates)
 
@@ -150,9 +151,9 @@ def test_a_damping_that_is_too_large_leaves_the_map_beside_its_poses() -> None:
     optimizer.damping = Damping(first=1e9, least=1e9, most=1e13)
     at, _ = optimizer.run(state, Stage(BATCH.gate, 1))
     assert np.abs(at.state.poses - state.poses).max() > 1e-3
-    for label, gauge in system.gauges.items():
-        seen = to_vehicle(state.control_points(label), state.poses[gauge.cycle])
-        after = to_vehicle(at.state.control_points(label), at.state.poses[gauge.cycle])
+    for label, weak in system.weak.items():
+        seen = to_vehicle(state.control_points(label), state.poses[weak.cycle])
+        after = to_vehicle(at.state.control_points(label), at.state.poses[weak.cycle])
         np.testing.assert_allclose(after, seen, atol=1e-6)
 
 

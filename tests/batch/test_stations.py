@@ -14,7 +14,7 @@ from pathspace_graph.batch.lap import OpenLap, along_of, lap_optimum, marginal_o
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.optimizer import predicted_decrease
 from pathspace_graph.batch.simplification import map_block, simplified
-from pathspace_graph.batch.system import SIGMA_SLIDE, BatchSystem, Evaluation, moved, nonlinear_graph
+from pathspace_graph.batch.system import BatchSystem, Evaluation, moved, nonlinear_graph
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Log
 from pathspace_graph.mapping.detections import NO_STATION
@@ -126,8 +126,6 @@ def test_a_setting_leaves_the_pure_projection() -> None:
     lap = open_lap(MapperSettings(stations=False))
     system, at, _ = lap_optimum(lap)
     assert system.stations is None and len(at.along.rows) == 0
-    assert system.sigma_slide == system.settings.batch.sigma_slide
-    assert optimum()[0].sigma_slide == SIGMA_SLIDE
 
 
 def test_stations_hold_the_vehicle_along_the_curves() -> None:

@@ -1,77 +1,19 @@
-"""Spacing and smoothness priors: Jacobians, GTSAM's range factor, straight lines, and the seam."""
+"""The prior of smoothness: straight lines, parabolas, and the seam."""
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 import pytest
 
-from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.bspline import SpanPolynomials, uniform_knots
 from pathspace_graph.factors.residuals import (
     greville,
-    pair_residuals,
     smoothness_coefficients,
     smoothness_matrix,
 )
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.jacobians import assert_jacobians
-
-NEARLY_COINCIDING = 1e-3
-"""Distance of two control points at which the direction still has a derivative to difference (m)."""
-
-
-def dense_spacing(points: Array, nominal: Array, periodic: bool) -> tuple[Array, Array]:
-    """Residuals and their dense Jacobian by all control points (2 m,)."""
-    first, m = points.reshape(-1, 2), points.size // 2
-    second = np.roll(first, -1, axis=0)
-    residual, direction = pair_residuals(first[: len(nominal)], second[: len(nominal)], nominal)
-    jacobian = np.zeros((len(residual), m, 2))
-    rows = np.arange(len(residual))
-    jacobian[rows, rows] -= direction
-    jacobian[rows, (rows + 1) % m] += direction
-    return residual, jacobian.reshape(len(residual), -1)
-
-
-@pytest.mark.parametrize("periodic", [False, True])
-@pytest.mark.parametrize("scale", [0.1, 1.0, 30.0])
-def test_spacing_jacobians(scale: float, periodic: bool) -> None:
-    rng = np.random.default_rng(0)
-    points = scale * rng.normal(size=(7, 2))
-    nominal = rng.uniform(1.0, 4.0, 7 if periodic else 6)
-    assert_jacobians(lambda c: dense_spacing(c, nominal, periodic), [points.ravel()])
-
-
-def test_spacing_jacobians_of_nearly_coinciding_points() -> None:
-    points = np.array([[1.0, 2.0], [1.0 + NEARLY_COINCIDING, 2.0], [4.0, 2.0]])
-    assert_jacobians(
-        lambda c: dense_spacing(c, np.full(2, 3.0), False), [points.ravel()], step=1e-7, tolerance=1e-4
-    )
-
-
-def test_coinciding_points_have_no_direction_and_nothing_is_nan() -> None:
-    residual, direction = pair_residuals(np.array([[1.0, 2.0]]), np.array([[1.0, 2.0]]), np.array([3.0]))
-    assert residual.tolist() == [-3.0]
-    assert direction.tolist() == [[0.0, 0.0]]
-
-
-@pytest.mark.parametrize("periodic", [False, True])
-def test_spacing_is_gtsams_range_factor(periodic: bool) -> None:
-    points = np.random.default_rng(1).normal(size=(5, 2)) * 4.0
-    nominal = np.linspace(1.0, 5.0, 5 if periodic else 4)
-    values = gtsam.Values()
-    for j, point in enumerate(points):
-        values.insert(j, point)
-    residual, jacobian = dense_spacing(points.ravel(), nominal, periodic)
-    for j, measured in enumerate(nominal):
-        k = (j + 1) % 5
-        factor = gtsam.RangeFactor2(j, k, measured, gtsam.noiseModel.Unit.Create(1))
-        linear = gtsam.JacobianFactor(factor.linearize(values))
-        np.testing.assert_allclose(factor.unwhitenedError(values), residual[j : j + 1], atol=1e-12)
-        expected = np.concatenate([jacobian[j, 2 * j : 2 * j + 2], jacobian[j, 2 * k : 2 * k + 2]])
-        order = np.concatenate([[2 * linear.keys().index(i), 2 * linear.keys().index(i) + 1] for i in (j, k)])
-        np.testing.assert_allclose(linear.getA()[0, order], expected, atol=1e-12)
 
 
 def test_smoothness_is_zero_on_straight_lines_with_uneven_abscissae() -> None:

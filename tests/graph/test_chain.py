@@ -95,7 +95,7 @@ class Drive:
             self.variables.remove(pose_keys(np.array([k])))
         if k >= 4 and k % 2 == 0:
             keyframes, point = self.variables.keyframes, POINTS[(k - 4) // 2 : (k - 2) // 2]
-            self.prior = self.chain.attach(self.prior, point, [], self.variables)
+            self.prior = self.chain.attach(self.prior, point, self.variables)
             self.anchors |= {int(key): self.variables.of(np.array([key])) for key in keyframes}
             self.variables.remove(keyframes)
 

@@ -268,7 +268,7 @@ def rows_of(mapper: FixedLagMapper) -> dict[int, Array]:
     """The rows of each cycle as they were linearized last."""
     kept = mapper.road.smoother.window.measured
     return {
-        owner: np.concatenate([rows.residual[rows.owner == owner] for rows in rows_in(kept)])
+        owner: np.sort(np.concatenate([rows.residual[rows.owner == owner] for rows in rows_in(kept)]))
         for owner in np.unique(kept.owners()).tolist()
     }
 

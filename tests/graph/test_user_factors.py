@@ -12,7 +12,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_twists
-from pathspace_graph.graph.gaussian import keys_of, normal_equations
+from pathspace_graph.graph.gaussian import keys_of
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
     Variables,
@@ -359,26 +359,6 @@ def test_a_factor_on_an_inactive_point_brings_the_map_back() -> None:
     mean, _ = with_rows(drive, [([L[1]], np.eye(2), at)])
     keys = drive.smoother.variables.keys
     np.testing.assert_allclose(drive.smoother.variables.values, mean[columns_of(keys, drive.keys)], atol=1e-7)
-
-
-def test_a_factor_on_points_is_relinearized_again_when_they_come_back() -> None:
-    """The user's factor itself is kept meanwhile, not its linearization."""
-    drive = LinearDrive(2)
-    drive.drive(7)
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, 0.1)
-    factor = gtsam.RangeFactor2(L[0], L[2], 3.0, noise)
-    drive.smoother.add_factors([factor])
-    drive.drive(1)
-    drive.deactivate(3)
-    assert drive.smoother.user_factors.factors == []
-    drive.smoother.reactivate()
-    assert drive.smoother.user_factors.factors == [factor]
-    for _ in range(30):
-        drive.smoother.step()
-    variables = drive.smoother.variables
-    gradient = normal_equations(drive.smoother.linear_graph(), drive.smoother.layout)
-    negative_gradient = gradient[1] - gradient[0] @ (variables.values - variables.reference)
-    np.testing.assert_allclose(negative_gradient, 0.0, atol=1e-5)
 
 
 def surveyed(cycle: int, label: int, aside: float) -> tuple[FixedLagMapper, Array]:

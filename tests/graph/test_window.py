@@ -18,7 +18,6 @@ from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
     POSE,
     SENSOR_KEY,
-    Layout,
     control_keys,
     pose_key,
     pose_keys,
@@ -45,9 +44,6 @@ class Track(LinearTrack):
 
     def rows(self, cycles: IntArray) -> list[Rows]:
         return self._weighed(super().rows(cycles))
-
-    def gauge(self, whole: bool) -> list[Rows]:
-        return self._weighed(super().gauge(whole))
 
     def _weighed(self, groups: Sequence[Rows]) -> list[Rows]:
         by = self.weight
@@ -112,12 +108,10 @@ def assert_linearized_at_the_values(window: WindowFactors[Track]) -> None:
     groups = [
         *track.rows(CYCLES),
         *window.odometry.rows(variables, CYCLES),
-        *track.gauge(False),
-        *track.linear_gauge(False),
     ]
     J, r, _ = dense_rows(groups, variables.keys)
     now = variables.values - variables.reference
-    hessian, gradient = newton_system(graph_of(), window.stores, variables.layout, now)
+    hessian, gradient = newton_system(graph_of(), [window.measured], variables.layout, now)
     np.testing.assert_allclose(np.tril(hessian), np.tril(J.T @ J), atol=1e-9 * np.abs(hessian).max())
     np.testing.assert_allclose(gradient, -J.T @ r, atol=1e-8 * np.abs(J.T @ J @ now).max())
 
@@ -130,7 +124,7 @@ def test_the_first_linearization_makes_every_factor() -> None:
 
 def test_a_factor_is_kept_while_nothing_moves_by_more_than_the_tolerance() -> None:
     window = make_window()
-    before, weak = mark(window), sizes_of(window.gauge)
+    before = mark(window)
     for key, entry, size in (
         (pose_key(1), 0, 0.9 * TOLERANCE_POINT),
         (pose_key(2), POSE - 1, -0.9 * TOLERANCE_HEADING),
@@ -139,7 +133,6 @@ def test_a_factor_is_kept_while_nothing_moves_by_more_than_the_tolerance() -> No
         move(window, key, entry, size)
     assert window.relinearize(CYCLES, ACTIVE)
     assert new_owners(window.measured, before) == []
-    assert new_owners(window.gauge, weak) == []
 
 
 @pytest.mark.parametrize(
@@ -156,16 +149,13 @@ def test_a_moved_pose_makes_its_own_cycle_stale_and_the_one_whose_odometry_leads
     assert new_owners(window.measured, before) == [1, 2]
 
 
-def test_a_moved_point_makes_the_cycles_and_the_weak_priors_stale_that_hold_it() -> None:
+def test_a_moved_point_makes_the_cycles_stale_that_hold_it() -> None:
     window, key = make_window(), int(control_keys(0, np.array(2)))
-    before, weak = mark(window), sizes_of(window.gauge)
+    before = mark(window)
     move(window, key, 0, 1.1 * TOLERANCE_POINT)
     assert window.relinearize(CYCLES, ACTIVE)
     assert 0 < len(new_owners(window.measured, before)) < len(CYCLES)
     assert new_owners(window.measured, before) == holding(window.measured, key)
-    replaced = new_owners(window.gauge, weak)
-    assert 0 < len(replaced) < len(weak)
-    assert replaced == holding(window.gauge, key)
 
 
 def test_small_motions_add_up_until_the_tolerance_is_passed() -> None:
@@ -256,17 +246,6 @@ def test_only_moved_variables_get_another_linearization_point() -> None:
     np.testing.assert_array_equal(variables.linearized, point)
 
 
-def test_weak_priors_between_other_points_are_all_made_again() -> None:
-    window = make_window()
-    before, weak = mark(window), sizes_of(window.gauge)
-    window.map.inactive, window.map.structure = control_keys(0, np.array([0])), object()
-    assert window.relinearize(CYCLES, ACTIVE)
-    assert new_owners(window.measured, before) == []
-    assert new_owners(window.gauge, weak) == list(sizes_of(window.gauge))
-    held = np.unique(np.concatenate([rows.keys for rows in rows_in(window.gauge)]))
-    np.testing.assert_array_equal(held, control_keys(0, np.arange(1, 6)))
-
-
 def on_an_inactive_point(window: WindowFactors[Track]) -> IntArray:
     """A stale cycle sees a point that is inactive."""
     move(window, pose_key(1), 0, 1.0)
@@ -296,27 +275,16 @@ def test_fresh_factors_are_at_the_values_and_leave_the_kept_ones_alone() -> None
     window = make_window()
     before = mark(window)
     window.variables.values += 0.5 * TOLERANCE_HEADING
-    fresh = normal_equations(graph_of(*window.fresh(CYCLES, whole=False)), window.variables.layout)
+    fresh = normal_equations(graph_of(*window.fresh(CYCLES)), window.variables.layout)
     assert new_owners(window.measured, before) == []
     window.exact = True
     assert window.relinearize(CYCLES, ACTIVE)
     variables = window.variables
     now = variables.values - variables.reference
-    hessian, gradient = newton_system(graph_of(), window.stores, variables.layout, now)
+    hessian, gradient = newton_system(graph_of(), [window.measured], variables.layout, now)
     scale = np.abs(hessian).max()
     np.testing.assert_allclose(np.tril(fresh[0]), np.tril(hessian), atol=1e-9 * scale)
     np.testing.assert_allclose(fresh[1] - fresh[0] @ now, gradient, atol=1e-9 * scale)
-
-
-def test_weak_priors_on_some_points_are_the_rows_that_hold_one_of_them() -> None:
-    """Points 1 and 2 have a prior each, and are neighbours of each other, of 0 and of 3."""
-    window, keys = make_window(), control_keys(0, np.array([1, 2]))
-    (factor,) = window.weak_on(keys)
-    layout = Layout(control_keys(0, np.arange(4)))
-    differences = np.diff(np.eye(4), axis=0)
-    spacing = differences.T @ differences
-    expected = np.kron(spacing / 9.0 + np.diag([0.0, 1.0, 1.0, 0.0]) / 81.0, np.eye(2))
-    np.testing.assert_allclose(normal_equations(graph_of(factor), layout)[0], expected, atol=1e-12)
 
 
 def test_dropped_factors_are_made_again() -> None:

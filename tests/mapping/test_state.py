@@ -137,7 +137,7 @@ def test_a_side_that_only_a_batch_has_found_closes_as_well() -> None:
     """Curves stay in the order of their labels, as their control points are."""
     settings, state = MapperSettings(), State()
     knots = np.arange(-3.0, 14.0)
-    closed = open_boundary(settings.spline, settings.gauge).closed(knots)
+    closed = open_boundary(settings.spline).closed(knots)
     state.replace_curves({RIGHT: closed, LEFT: closed})
     assert [*state.boundaries] == [LEFT, RIGHT]
     assert state.closed
@@ -151,7 +151,7 @@ def refined(state: State) -> State:
     finer = state.copy()
     for label, old in state.boundaries.items():
         knots = np.union1d(old.knots, 0.5 * (old.knots[1:] + old.knots[:-1]))[old.degree : -old.degree]
-        boundary = Boundary(knots, False, old.settings, old.gauge)
+        boundary = Boundary(knots, False, old.settings)
         boundary.confirmed_end = boundary.tables.high
         u = np.linspace(boundary.tables.low, boundary.tables.high, 4 * boundary.size)
         curve = old.evaluate(state.control_points(label), u)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,12 +34,11 @@ NOTHING = np.zeros(0, np.intp)
 
 
 class LinearTrack:
-    """Holds map points in a row, measurements `J x - z` of each cycle, and weak priors between neighbours."""
+    """Holds map points in a row, measurements `J x - z` of each cycle, and weak priors of its new points."""
 
     def __init__(self, seed: int) -> None:
         self.variables = Variables()
         self.reached_inactive = False
-        self.structure: object = object()
         self.inactive: IntArray = NOTHING
         self.seed = seed
 
@@ -55,7 +53,9 @@ class LinearTrack:
         return np.stack(keys, axis=1), rng.normal(size=(6, POSE + 4)) * 2.0, rng.normal(size=6) * 5.0
 
     def rows(self, cycles: IntArray) -> list[Rows]:
-        return [self._at_values(*self.measured(int(k)), int(k)) for k in cycles]
+        return [
+            self._at_values(*one, k) for k in cycles.tolist() for one in (self.measured(k), *self.placed(k))
+        ]
 
     def _at_values(self, keys: IntArray, J: Array, z: Array, owner: int) -> Rows:
         values = np.array([self.variables.of(one) for one in keys])
@@ -67,29 +67,22 @@ class LinearTrack:
     def linearized(self, cycles: IntArray) -> None:
         pass
 
-    def weak(self, whole: bool) -> tuple[IntArray, IntArray]:
-        """Returns keys (k, 2) of neighbours with a weak prior, and keys (m,) of points with a weak prior."""
-        known = self.variables.keys
-        known = known[(known >= control_keys(0, np.array(0))) & (known < pose_key(0))]
-        active = known if whole else np.setdiff1d(known, self.inactive)
-        return np.stack([active[:-1], active[1:]], axis=1), active
+    def placed(self, cycle: int) -> list[tuple[IntArray, Array, Array]]:
+        """Returns keys, J and z of the weak priors of the points that a cycle is the first to see.
 
-    def gauge(self, whole: bool) -> list[Rows]:
-        """Returns `(c_{j+1} - c_j - (1, 2)) / 3`, a row for each coordinate."""
-        pairs, _ = self.weak(whole)
-        J = np.kron(np.array([-1.0, 1.0]), np.eye(2)) / 3.0
-        return [
-            self._at_values(np.stack([p, p]), J, np.array([1.0, 2.0]) / 3.0, int(p[0] % 5)) for p in pairs
-        ]
-
-    def linear_gauge(self, whole: bool) -> list[Rows]:
-        """Returns `(c_j - (4, 5)) / 9`, a row for each coordinate."""
-        _, points = self.weak(whole)
-        z = np.array([4.0, 5.0]) / 9.0
-        return [self._at_values(np.array([[key], [key]]), np.eye(2) / 9.0, z, int(key % 5)) for key in points]
+        They are `(c_j - (4, 5)) / 9`, and `(c_j - c_{j-1} - (1, 2)) / 3` of neighbours.
+        """
+        first, last = (0, 2) if cycle == 0 else (cycle + 2, min(cycle + 2, POINTS - 1))
+        between, rows = np.kron(np.array([-1.0, 1.0]), np.eye(2)) / 3.0, []
+        for j in range(first, last + 1):
+            own, before = control_keys(0, np.array([[j]])), control_keys(0, np.array([[j - 1, j]]))
+            rows.append((np.repeat(own, 2, axis=0), np.eye(2) / 9.0, np.array([4.0, 5.0]) / 9.0))
+            if j:
+                rows.append((np.repeat(before, 2, axis=0), between, np.array([1.0, 2.0]) / 3.0))
+        return rows
 
     def activate_all(self) -> None:
-        self.inactive, self.structure = NOTHING, object()
+        self.inactive = NOTHING
 
     def drop_cycle(self, cycle: int) -> None:
         pass
@@ -169,14 +162,12 @@ class LinearDrive:
         """Inserts new map points at random places."""
         points = self.rng.normal(size=(len(numbers), 2)) * 7.0
         self.smoother.variables.insert(control_keys(0, numbers), points.ravel())
-        self.track.structure = object()
 
     def deactivate(self, before: int) -> None:
         """Deactivates map points below a number, which no pose of the window may see."""
         keys = np.setdiff1d(control_keys(0, np.arange(before)), self.track.inactive)
         self.smoother.deactivate(keys)
         self.track.inactive = np.union1d(self.track.inactive, keys)
-        self.track.structure = object()
 
     # --- the batch ---------------------------------------------------------------------------------------
 
@@ -195,23 +186,15 @@ class LinearDrive:
         matrices.append(_scattered([pose_key(0)], np.diag(1.0 / SIGMA_START), keys))
         right.append(self.start / SIGMA_START)
         for k in range(self.cycles):
-            own, J, z = self.track.measured(k)
-            matrices.append(dense_rows([Rows(own, J, z, np.zeros(len(z), np.intp))], keys)[0])
-            right.append(z)
+            for own, J, z in (self.track.measured(k), *self.track.placed(k)):
+                matrices.append(dense_rows([Rows(own, J, z, np.zeros(len(z), np.intp))], keys)[0])
+                right.append(z)
         for k, step in enumerate(self.odometry):
             J = step.whitener @ np.concatenate(
                 [step.calibration_jacobian, -np.eye(POSE), np.eye(POSE)], axis=1
             )
             matrices.append(_scattered([CALIBRATION_KEY, pose_key(k), pose_key(k + 1)], J, keys))
             right.append(step.whitener @ step.delta)
-        points = control_keys(0, np.arange(min(self.cycles + 2, POINTS))).tolist()
-        for first, second in pairwise(points):
-            J = np.kron(np.array([-1.0, 1.0]), np.eye(2)) / 3.0
-            matrices.append(_scattered([first, second], J, keys))
-            right.append(np.array([1.0, 2.0]) / 3.0)
-        for key in points:
-            matrices.append(_scattered([key], np.eye(2) / 9.0, keys))
-            right.append(np.array([4.0, 5.0]) / 9.0)
         J, z = np.concatenate(matrices), np.concatenate(right)
         return J.T @ J, J.T @ z
 

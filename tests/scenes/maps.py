@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
+from pathspace_graph.settings.mapper import SplineSettings
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 from pathspace_graph.spline.bspline import BSpline
 
@@ -19,7 +19,7 @@ SIGMA = 0.1
 
 def boundary_through(points: Array, settings: SplineSettings | None = None) -> tuple[Boundary, Array]:
     """Returns an open boundary through cones (k, 2), parametrized by their distances; control points."""
-    boundary = open_boundary(settings or SplineSettings(), GaugeSettings())
+    boundary = open_boundary(settings or SplineSettings())
     u = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
     control_points = boundary.grow(np.zeros((0, 2)), u, points)
     boundary.add_cones(points, u)

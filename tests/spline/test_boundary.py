@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import BSpline as ScipyBSpline
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.settings.mapper import GaugeSettings, SplineSettings
+from pathspace_graph.settings.mapper import SplineSettings
 from pathspace_graph.spline.boundary import Boundary, ahead_of, open_boundary, relocate
 
 from ..scenes.maps import boundary_through
@@ -36,7 +36,7 @@ def u_turn(radius: float = 4.0, straight: float = 20.0) -> tuple[Boundary, Array
 
 
 def test_an_open_boundary_begins_with_one_span_at_its_first_cone() -> None:
-    boundary = open_boundary(SPLINE, GaugeSettings())
+    boundary = open_boundary(SPLINE)
     assert (boundary.tables.low, boundary.tables.high) == (0.0, SPLINE.spacing)
     assert boundary.size == boundary.degree + 1
     assert (np.diff(boundary.knots) == SPLINE.spacing).all()
@@ -45,7 +45,7 @@ def test_an_open_boundary_begins_with_one_span_at_its_first_cone() -> None:
 @pytest.mark.parametrize(("last", "size"), [(3.0, 4), (3.0001, 5), (6.0, 5), (11.9, 7), (12.0, 7), (12.1, 8)])
 def test_it_has_as_many_spans_as_its_last_cone_needs(last: float, size: int) -> None:
     """Spans of 3 m: one span has 4 control points, each further one has one more."""
-    boundary = open_boundary(SPLINE, GaugeSettings())
+    boundary = open_boundary(SPLINE)
     points = boundary.grow(np.zeros((0, 2)), np.array([0.0, last]), np.array([[0.0, 0.0], [last, 0.0]]))
     assert boundary.size == len(points) == size
     assert boundary.confirmed_end == last
@@ -91,7 +91,7 @@ def test_growth_reaches_for_the_cones_and_keeps_what_was_confirmed(steps: list[t
     )
     cones = np.concatenate([[[0.0, 0.0]], np.cumsum(offsets, axis=0)])
     u = np.append(0.0, np.cumsum(np.hypot(*offsets.T)))
-    boundary = open_boundary(SPLINE, GaugeSettings())
+    boundary = open_boundary(SPLINE)
     points = boundary.grow(np.zeros((0, 2)), u[:2], cones[:2])
     for k in range(2, len(cones)):
         held = np.linspace(0.0, max(boundary.confirmed_end - 2.0 * SPLINE.spacing, 0.0), 20)
@@ -159,18 +159,6 @@ def test_a_closed_curve_is_scipy_s() -> None:
     np.testing.assert_allclose(closed.evaluate(points, u), scipy(u), atol=1e-12)
     np.testing.assert_allclose(closed.evaluate(points, u + 48.0), scipy(u), atol=1e-9)
     np.testing.assert_allclose(closed.spline(points).evaluate(u), scipy(u), atol=1e-12)
-
-
-def test_the_gauge_of_a_closed_curve_goes_all_around_and_that_of_a_stretch_does_not() -> None:
-    closed = line(24.0)[0].closed(np.arange(-9.0, 34.0, 3.0))
-    whole = closed.gauge_on(closed.everything)
-    assert whole.pairs.tolist() == [[j, (j + 1) % 8] for j in range(8)]
-    assert len(whole.triples) == 8
-    seam = closed.gauge_on(np.array([6, 7, 0, 1]))
-    assert seam.pairs.tolist() == [[6, 7], [7, 0], [0, 1]]
-    assert seam.triples.tolist() == [[6, 7, 0], [7, 0, 1]]
-    np.testing.assert_allclose(whole.nominal, 3.0)
-    np.testing.assert_allclose(seam.bending, np.tile([1.0, -2.0, 1.0], (2, 1)) / 3.0)
 
 
 # --- foot points ---------------------------------------------------------------------------------------
