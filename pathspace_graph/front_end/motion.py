@@ -86,9 +86,10 @@ class SensorErrors:
         """Whether the errors contradict the sensor's prior by more than `settings.doubt` sigmas."""
         if not settings.sensor:
             return False
-        limit, prior = settings.doubt**2, (settings.sigma_yaw, settings.sigma_latency)
-        known = zip(self.mean.tolist(), self.covariance.diagonal().tolist(), prior, strict=True)
-        return any(mean**2 > limit * (variance + sigma**2) for mean, variance, sigma in known)
+        limit, (yaw, latency) = settings.doubt**2, self.mean.tolist()
+        (of_yaw, _), (_, of_latency) = self.covariance.tolist()
+        is_turned = yaw**2 > limit * (of_yaw + settings.sigma_yaw**2)
+        return bool(is_turned or latency**2 > limit * (of_latency + settings.sigma_latency**2))
 
     def found(self, settings: CalibrationSettings) -> CalibrationSettings:
         """Return wide priors of the sensor with the learned yaw and latency as means.

@@ -13,10 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pathspace_graph.factors import _kernels as kernels
-from pathspace_graph.factors.se2 import to_map, to_vehicle
+from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.front_end.motion import MATCHING, Matching
-
-from ..scenes.jacobians import numeric_jacobian
 
 Array = NDArray[np.float64]
 REACHES = [1.0, 0.8, 0.6, 0.5, 0.4]
@@ -57,23 +55,9 @@ def test_exact_detections_give_the_exact_motion(x: float, y: float, theta: float
     assert found.is_certain and found.is_matched.all()
 
 
-# the information, where no coordinate, heading, weight or variance is a special one
+# where no coordinate, heading, weight or variance is a special one
 POSE = np.array([3.0, -2.0, 0.7])
 ASYMMETRIC = np.array([[8.0, 1.0], [4.0, 5.5], [12.0, 9.0], [5.0, -4.0], [2.5, 1.0]])
-VARIANCES = np.array([0.01, 0.04, 0.02, 0.09, 0.03])
-
-
-@pytest.mark.parametrize("n", [1, 3])
-def test_the_information_is_that_of_one_detection_and_the_mean_of_n(n: int) -> None:
-    """Each offset has the variance `v (1 + 1/n) + sigma_cone^2`; its derivatives are numeric ones."""
-    seen = detected(POSE, ASYMMETRIC)
-    found = match(np.tile(ASYMMETRIC, (n, 1)), seen, VARIANCES, POSE, REACHES[:1])
-    jacobian = numeric_jacobian(lambda pose: to_map(seen, np.tile(pose, (len(seen), 1))).ravel(), POSE)
-    precision = np.repeat(1.0 / (VARIANCES * (1.0 + 1.0 / n) + MATCHING.sigma_cone**2), 2)
-    expected = jacobian.T @ (precision[:, None] * jacobian)
-    assert np.abs(expected[2, :2]).min() > 100.0  # x and y are told together with the heading
-    np.testing.assert_allclose(found.information, expected, rtol=1e-6, atol=1e-6)
-    assert found.misfit == pytest.approx(0.0, abs=1e-12)
 
 
 def test_the_covariance_is_that_of_many_noisy_matches() -> None:
