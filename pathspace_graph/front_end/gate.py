@@ -30,6 +30,7 @@ from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.online import LimitSettings
 
 TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
+KNOWN_LABELS: Final = "one of " + ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
 LATEST_STAMP: Final = 1e11  # largest stamp (s), 3000 years: stamps in nanoseconds are larger
 STAMPS: Final = f"at most {LATEST_STAMP:g} s (stamps are in seconds)"
 MAX_TWISTS: Final = 100_000  # largest number of twists in a cycle, which bounds its time
@@ -196,10 +197,7 @@ def _possible_detections(
     count, field = len(points), "detections.labels"
     covariances = _array(detections.covariances, "detections.covariances", (count, 2, 2)).astype(np.float64)
     labels = _array(detections.labels, field, (count,), "iu", "integers").astype(np.int_)
-    strange = np.flatnonzero((labels < LEFT) | (labels >= len(NAMES)))
-    if len(strange):
-        known = "one of " + ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
-        raise ReadingError(field, known, labels[strange[0]].item(), int(strange[0]))
+    _require((labels >= LEFT) & (labels < len(NAMES)), field, KNOWN_LABELS, labels)
     if count > most:
         raise ReadingError("detections.points_vehicle", f"at most {most} rows", count)
     ranges, sigmas = (MIN_RANGE, limits.range_max), (MIN_SIGMA, MAX_SIGMA)

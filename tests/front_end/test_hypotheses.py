@@ -201,10 +201,10 @@ def test_random_drives_have_the_motions_of_the_formulas() -> None:
         rng = np.random.default_rng(seed)
         cones = np.column_stack([rng.uniform(-2.0, 16.0, 14), rng.uniform(-6.0, 6.0, 14)])
         check, formulas, true = MotionCheck(TwistNoise(SIGMA), MotionSettings()), Formulas(), np.zeros(3)
-        for k in range(1, 8):
+        for k in range(1, 10):
             twist = np.array([rng.uniform(4.0, 7.0), rng.uniform(-0.3, 0.3), rng.uniform(-0.6, 0.6)])
             true = compose(true, 0.1 * twist)
-            if k == 7 and seed % 2:
+            if k == 9 and seed % 2:
                 true = compose(true, rng.uniform([0.5, -1.5, -0.3], [3.0, 1.5, 0.3]))
             factor = 1.0 if k < 4 else rng.choice([1.0, 1.4, 2.5, 0.0, np.nan])
             stamps = 0.1 * (k - 1) + 0.025 * np.arange(0 if np.isnan(factor) else 4)
@@ -220,6 +220,7 @@ def test_random_drives_have_the_motions_of_the_formulas() -> None:
             assert motion.doubted == (is_other and not motion.missing), (seed, k, outcome)
             np.testing.assert_allclose(motion.odometry.delta, delta, atol=1e-9)
             np.testing.assert_allclose(motion.odometry.covariance, covariance, rtol=1e-6, atol=1e-12)
+            assert motion.odometry.calibration_jacobian.any() == (not is_other and not motion.missing)
             np.testing.assert_array_equal(check.seen_again, again)
             np.testing.assert_allclose(check.errors.mean, formulas.errors, atol=1e-10)
             np.testing.assert_allclose(check.errors.covariance, formulas.covariance, rtol=1e-7)

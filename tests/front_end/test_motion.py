@@ -115,14 +115,6 @@ def test_a_yaw_rate_is_not_believed_beside_speeds_that_are_contradicted_if_it_is
     assert np.abs(errors(log, motions).cumsum(axis=0))[:, 2].max() < 0.1
 
 
-def test_the_scale_of_the_speeds_is_not_learned_from_a_slip(log: Log) -> None:
-    motions = checked(faulty(log, lambda twist: twist * [1.5, 1.5, 1.0]))
-    for motion in motions:
-        if motion.doubted:
-            np.testing.assert_array_equal(motion.odometry.calibration_jacobian, 0.0)
-            assert motion.odometry.covariance[0, 0] > 0.03**2
-
-
 def test_a_gap_is_filled_by_the_detections(log: Log) -> None:
     motions = checked(without_readings(log))
     at = told(log, motions)
