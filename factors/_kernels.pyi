@@ -8,6 +8,7 @@ from typing import Any, Final, Protocol
 
 from .arrays import Array, BoolArray, IntArray
 from .bspline import SpanPolynomials
+from .noise import TwistNoise
 
 COMPILER: Final[str]
 """Name and version of the compiler that built them."""
@@ -56,6 +57,22 @@ class _Link(Protocol):
     @property
     def noise(self) -> Array: ...
 
+class _MotionSettings(Protocol):
+    """What is read of `settings.online:MotionSettings`."""
+
+    @property
+    def doubt(self) -> float: ...
+    @property
+    def accelerations(self) -> tuple[float, float, float]: ...
+
+class _Matching(Protocol):
+    """`front_end.motion:Matching`, of which all fields are read."""
+
+    @property
+    def of_lines(self) -> bool: ...
+
+_Odometry = tuple[Array, Array, Array, Array, Array]
+"""The fields of `factors.odometry:IntegratedOdometry`."""
 _Parts = tuple[IntArray, Array, Array, IntArray]
 """The fields of `graph.rows:Rows`."""
 _FootPoints = tuple[Array, Array, Array, Array, Array, BoolArray, Array, IntArray, IntArray]
@@ -166,23 +183,6 @@ def station_rows(
         dr/dp = t,   dr/dc_j = -beta_j(u) t + n . (p - S) beta'_j(u) / |S'| n
 
     The rest is as in `detection_rows`.
-    """
-
-def held_twists(
-    stamps: Array,
-    twists: Array,
-    until: float,
-    first: float,
-    interval: float,
-    hold: tuple[float, float],
-    accelerations: tuple[float, float, float],
-) -> tuple[Array, Array, float, bool, int]:
-    """Return the durations (k,) of twists (k, 3), held until the next one or `until` (s), and their excess.
-
-    The excess, (k, 3) or (3,) if it is zero, grows by `accelerations` while a twist is held for longer than
-    `hold[0]` s and `hold[1]` shortest intervals; the first twist was measured at `first` (s). The other
-    results are the shortest `interval` so far, whether the last twist is held for longer, and the number of
-    twists that equal the one before.
     """
 
 def integrated(durations: Array, twists: Array, sigmas: Array) -> tuple[Array, Array, Array]:
@@ -317,75 +317,72 @@ def usable(points: Array, covariances: Array, limits: tuple[float, ...]) -> tupl
     The limits are those of the range, MAX_ASYMMETRY, MIN_DETERMINANT, MIN_SIGMA and MAX_SIGMA.
     """
 
+class MotionCheck:
+    """Check of each cycle's odometry against the detections of the newest cycles; see `front_end.motion`."""
+
+    def __init__(self, noise: TwistNoise, settings: _MotionSettings, matching: _Matching) -> None: ...
+    @property
+    def pose(self) -> Array:
+        """Newest pose (3,) by dead reckoning; the first one is 0."""
+
+    @property
+    def seen_again(self) -> BoolArray:
+        """Which detections (m,) of the newest cycle lie on those of the cycles before."""
+
+    @property
+    def errors(self) -> tuple[Array, Array]:
+        """Mean (2,) and covariance (2, 2) of yaw and latency of the sensor."""
+
+    def copy(self) -> MotionCheck:
+        """Return a check that can change independently."""
+
+    def set_noise(self, noise: TwistNoise) -> None:
+        """Set the noise of a twist, and forget the detections and the learned errors of the sensor."""
+
+    def update(
+        self,
+        stamps: Array,
+        twists: Array,
+        t: float,
+        points: Array,
+        covariances: Array,
+        may_contradict: bool,
+    ) -> tuple[_Odometry, Array, bool, bool, bool, tuple[float, float] | None, Array | None, Array, bool]:
+        """Return the fields of the motion since the previous cycle, and whether a rest ends with it.
+
+        They are those of `mapping.motion:MeasuredMotion`, with those of its odometry, and of its bias. Twists
+        (k, 3) have stamps (k,), and detections at t (s) points (m, 2), vehicle frame, and covariances (m, 2,
+        2).
+        """
+
 def matched(
-    recent: Array,
+    earlier: Array,
     points_vehicle: Array,
     variances: Array,
     start: Array,
     reaches: Sequence[float],
-    limits: tuple[float, ...],
-    line: tuple[float, ...],
-    held: Array,
-) -> tuple[Array, Array, BoolArray, float]:
-    """Return the pose (3,) of `ScanMatcher.match`; of its last step information, matches (m,) and cost.
+    matching: _Matching,
+) -> tuple[Array, Array, BoolArray, float, bool]:
+    """Register detections (m, 2) to earlier ones (n, 2) by Gauss-Newton steps from a pose (3,).
 
-    The limits are `FARTHEST`, `MIN_WEIGHT`, `SCAN_HUBER`, `SIGMA_CONE`, `MIN_MATCHED` and `LEAST_SHARE`. For
-    points of lines, `line` has the limits from `LINE_REACH` on, `held` (3, 3) is information about the start,
-    and all results are those at the pose.
+    Each step, one for each of the reaches (m), minimizes `sum_i |R z_i + t - m_i|^2 / sigma_i^2` with Huber's
+    loss. m_i is the weighted mean of the earlier detections near the point, n_i the sum of the weights, and
+    `sigma_i^2 = variance_i (1 + 1/n_i) + sigma_cone^2`. Of a point of a line, only the distance across the
+    line counts, and the start is held along it.
+
+    The results are the pose (3,) in the frame of the earlier detections, the information (3, 3) about it,
+    which detections (m,) coincide with earlier ones, the mean square of their whitened distances, and whether
+    enough of them do and hold the pose in every direction (lines: its heading). All but the pose are those of
+    the last step; for lines those at the pose, and the information includes `lines_alike`.
     """
 
 def misfit(
-    recent: Array,
-    points_vehicle: Array,
-    variances: Array,
-    pose: Array,
-    reach: float,
-    limits: tuple[float, ...],
-    line: tuple[float, ...],
-    most: float,
+    earlier: Array, points_vehicle: Array, variances: Array, pose: Array, reach: float, matching: _Matching
 ) -> float:
-    """Return the mean square, each at most `most`, of the whitened distances of `matched` at a pose (3,)."""
+    """Return the mean square of the whitened distances of `matched` at a given pose (3,).
 
-def weighted_means(points: Array, recent: Array, reach: float, farthest: float) -> tuple[Array, Array]:
-    """Return means (m, 2) of recent points by `exp(-d^2 / 2 reach^2)`, and the sums of weights."""
-
-def standstill_gains(
-    points: Array,
-    covariances: Array,
-    pose: Array,
-    cycles: Sequence[tuple[Array, Array]],
-    shares: Sequence[float],
-    sigma: float,
-    most: float,
-) -> Array:
-    """Return the gains (h + 1, k) of a cycle with k others, a row for each hypothesis.
-
-    A hypothesis is a share of the motion by odometry. The gain of a detection (m, 2), with covariance (m, 2,
-    2), is `max(0, most - d^2)` with its distance d from the nearest one of the other cycle, whitened by twice
-    the covariance plus `sigma^2`. Cycles have points (n, 2), vehicle frame, and a pose (3,) by odometry.
-    Detections outside the other cycle's view, by odometry, have no gain: the view moves with the vehicle, and
-    its border matches only at standstill. The last row sums (first - last hypothesis)^2 over detections.
+    Each counts up to `most_misfit`, and so do detections that match nothing.
     """
-
-def off_prediction(
-    pose: Array,
-    information: Array,
-    excess: float,
-    predicted: Array,
-    covariance: Array,
-    shifts: Array,
-    errors: Array,
-) -> tuple[Array, Array, Array, float]:
-    """Return how far a match, of variance times `excess`, is off a prediction.
-
-    The offset d (3,) has the covariance K (3, 3) without errors of the sensor, and `K + S P S'` with them, by
-    its derivatives S (3, 2) and their covariance P (2, 2). The last result is `d' (K + S P S')^-1 d`.
-    """
-
-def learned(
-    mean: Array, errors: Array, drift: Array, off: Array, covariance: Array, shifts: Array, share: float
-) -> tuple[Array, Array]:
-    """Return mean (2,) and covariance (2, 2) of the errors after a measurement that counts by a share."""
 
 def by_constants(
     seen: Array, twists: Array, poses: Array, by_bias: Array, first: IntArray, bends_from: float

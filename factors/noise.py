@@ -110,10 +110,6 @@ class TwistNoise:
         walk = self.drift**2 / np.maximum(durations, MIN_DURATION)[:, None]
         return np.asarray(np.sqrt(self.white**2 + walk))
 
-    def of_mean(self, count: int, duration: float) -> Array:
-        """Standard deviation (3,) of the mean of `count` twists over a duration (s)."""
-        return np.asarray(np.sqrt(self.white**2 / count + self.drift**2 / max(duration, MIN_DURATION)))
-
 
 MIN_DURATION: Final = 1e-6  # s; a twist that is held for less moves nothing
 

@@ -22,6 +22,7 @@ void add_detections(py::module_& module);
 void add_cones(py::module_& module);
 void add_constellations(py::module_& module);
 void add_odometry(py::module_& module);
+void add_motion_check(py::module_& module);
 void add_scan_matching(py::module_& module);
 void add_noise(py::module_& module);
 
@@ -38,6 +39,7 @@ PYBIND11_MODULE(_kernels, module) {
   kernels::add_cones(module);
   kernels::add_constellations(module);
   kernels::add_odometry(module);
+  kernels::add_motion_check(module);
   kernels::add_scan_matching(module);
   kernels::add_noise(module);
 }

@@ -1,6 +1,6 @@
 // Odometry, and the path driven.
 
-#include "common.hpp"
+#include "odometry.hpp"
 
 namespace kernels {
 namespace {
@@ -33,8 +33,10 @@ py::tuple along_and_across(const Array& points, const Array& path, const Array& 
   return py::make_tuple(along, across);
 }
 
+}  // namespace
+
 // The exponential of SE(2) of a twist over a time.
-void se2_exp(const double* twist, double dt, double* pose) {
+static void se2_exp(const double* twist, double dt, double* pose) {
   const double x = twist[0] * dt, y = twist[1] * dt, theta = twist[2] * dt;
   const double half = theta == 0.0 ? std::numeric_limits<double>::min() : 0.5 * theta;
   const double sine = std::sin(half), cosine = std::cos(half);
@@ -42,30 +44,24 @@ void se2_exp(const double* twist, double dt, double* pose) {
   pose[0] = sinc * x - cosc * y, pose[1] = cosc * x + sinc * y, pose[2] = theta;
 }
 
-py::tuple integrated(const Array& durations, const Array& twists, const Array& sigmas) {
-  const Index count = durations.shape(0);
-  expect(count > 0 && twists.size() == 3 * count && sigmas.size() == 3 * count);
+Integrated integrate(Index count, const double* durations, const double* twists, const double* sigmas) {
   std::vector<double> poses(3 * count);
-  double end[3] = {0.0, 0.0, 0.0}, step[3];
+  Integrated out;
+  Pose &end = out.end, step;
   for (Index k = 0; k < count; ++k) {
-    se2_exp(twists.data() + 3 * k, durations.data()[k], step);
+    se2_exp(twists + 3 * k, durations[k], step.data());
     const Turn turn(end[2]);
     end[0] += turn.c * step[0] - turn.s * step[1];
     end[1] += turn.s * step[0] + turn.c * step[1];
     end[2] += step[2];
-    std::copy(end, end + 3, &poses[3 * k]);
+    std::copy(end.begin(), end.end(), &poses[3 * k]);
   }
-  Array covariance(Shape{3, 3}), by_calibration(Shape{3, 2});
-  double* K = covariance.mutable_data();
-  double* G = by_calibration.mutable_data();
-  std::fill(K, K + 9, 0.0);
-  std::fill(G, G + 6, 0.0);
   const Turn last(end[2]);
   for (Index k = 0; k < count; ++k) {
-    const double* twist = twists.data() + 3 * k;
+    const double* twist = twists + 3 * k;
     const double* after = &poses[3 * k];
-    const double dt = durations.data()[k];
-    se2_exp(twist, -0.5 * dt, step);
+    const double dt = durations[k];
+    se2_exp(twist, -0.5 * dt, step.data());
     const Turn turn(after[2]), from_end(after[2] + step[2] - end[2]);
     const double dx = after[0] + turn.c * step[0] - turn.s * step[1] - end[0];
     const double dy = after[1] + turn.s * step[0] + turn.c * step[1] - end[1];
@@ -73,46 +69,21 @@ py::tuple integrated(const Array& durations, const Array& twists, const Array& s
                             {from_end.s, from_end.c, -(last.c * dx + last.s * dy)},
                             {0.0, 0.0, 1.0}};
     for (int i = 0; i < 3; ++i) {
-      G[2 * i] += (A[i][0] * twist[0] + A[i][1] * twist[1]) * dt;
-      G[2 * i + 1] += A[i][2] * dt;
+      out.by_calibration[2 * i] += (A[i][0] * twist[0] + A[i][1] * twist[1]) * dt;
+      out.by_calibration[2 * i + 1] += A[i][2] * dt;
       for (int j = 0; j < 3; ++j)
         for (int c = 0; c < 3; ++c) {
-          const double sigma = dt * sigmas.data()[3 * k + c];
-          K[3 * i + j] += A[i][c] * sigma * (A[j][c] * sigma);
+          const double sigma = dt * sigmas[3 * k + c];
+          out.covariance[3 * i + j] += A[i][c] * sigma * (A[j][c] * sigma);
         }
     }
   }
-  return py::make_tuple(Array(Shape{3}, end), covariance, by_calibration);
+  return out;
 }
 
-py::tuple held_twists(const Array& stamps, const Array& twists, double until, double first, double interval,
-                      const py::tuple& hold, const Array& accelerations) {
-  const Index k = stamps.size();
-  expect(k > 0 && twists.size() == 3 * k && accelerations.size() == 3);
-  const double* t = stamps.data();
-  for (Index i = 1; i < k; ++i) interval = std::min(interval, t[i] - (i > 1 ? t[i - 1] : first));
-  const double room = std::max(hold[0].cast<double>(), hold[1].cast<double>() * interval);
-  Array durations(k), excess(Shape{k, 3}), none(Shape{3});
-  std::fill_n(none.mutable_data(), 3, 0.0);
-  bool is_long = false, is_missing = false;
-  Index same = 0;
-  for (Index i = 0; i < k; ++i) {
-    const double end = i + 1 < k ? t[i + 1] : until;
-    const double longer = std::max(end - (i ? t[i] : first) - room, 0.0);
-    const double* twist = twists.data() + 3 * i;
-    durations.mutable_data()[i] = end - t[i];
-    for (int c = 0; c < 3; ++c) excess.mutable_data()[3 * i + c] = longer * accelerations.data()[c];
-    is_missing = longer > 0.0;
-    is_long = is_long || is_missing;
-    same += i && std::equal(twist, twist + 3, twist - 3);
-  }
-  return py::make_tuple(durations, is_long ? excess : none, interval, is_missing, same);
-}
-
-Array whitener(const Array& covariance, double least) {
-  expect(covariance.size() == 9);
-  const double* K = covariance.data();
-  double L[3][3] = {}, values[9] = {};
+Matrix3 whitener_of(const double* K, double least) {
+  double L[3][3] = {};
+  Matrix3 values{};
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j <= i; ++j) {
       double sum = K[3 * i + j] + (i == j ? least * least : 0.0);
@@ -125,7 +96,22 @@ Array whitener(const Array& covariance, double least) {
       for (int k = j; k < i; ++k) sum -= L[i][k] * values[3 * k + j];
       values[3 * i + j] = sum / L[i][i];
     }
-  return Array(Shape{3, 3}, values);
+  return values;
+}
+
+namespace {
+
+py::tuple integrated(const Array& durations, const Array& twists, const Array& sigmas) {
+  const Index count = durations.shape(0);
+  expect(count > 0 && twists.size() == 3 * count && sigmas.size() == 3 * count);
+  const Integrated of = integrate(count, durations.data(), twists.data(), sigmas.data());
+  return py::make_tuple(array_of({3}, of.end), array_of({3, 3}, of.covariance),
+                        array_of({3, 2}, of.by_calibration));
+}
+
+Array whitener(const Array& covariance, double least) {
+  expect(covariance.size() == 9);
+  return array_of({3, 3}, whitener_of(covariance.data(), least));
 }
 
 py::tuple odometry_residuals(const Array& starts, const Array& ends, const Array& deltas) {
@@ -206,7 +192,6 @@ void add_odometry(py::module_& module) {
   module.def("whitened_odometry", &whitened_odometry);
   module.def("along_and_across", &along_and_across);
   module.def("odometry_residuals", &odometry_residuals);
-  module.def("held_twists", &held_twists);
   module.def("integrated", &integrated);
   module.def("whitener", &whitener);
 }

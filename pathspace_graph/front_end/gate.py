@@ -30,6 +30,7 @@ from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.online import LimitSettings
 
 TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
+KNOWN_LABELS: Final = "one of " + ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
 LATEST_STAMP: Final = 1e11  # largest stamp (s), 3000 years: stamps in nanoseconds are larger
 STAMPS: Final = f"at most {LATEST_STAMP:g} s (stamps are in seconds)"
 MAX_TWISTS: Final = 100_000  # largest number of twists in a cycle, which bounds its time
@@ -111,8 +112,8 @@ class Gate(Copyable):
             elif twist is not None:
                 stamps, twists = np.append(newest, stamps), np.concatenate([twist[None], twists])
         count = len(possible.labels)
-        one_of = max(-(-count // MOST_DETECTIONS), 1)  # of every few, where there are more than the most
-        possible = possible.where(np.arange(count) % one_of == 0)
+        if count > MOST_DETECTIONS:  # points of lines: one of every few
+            possible = possible.where(np.arange(count) % -(-count // MOST_DETECTIONS) == 0)
         return Admitted(Odometry(stamps, twists), possible, dropped, refused, notice)
 
     def refuse(self) -> None:
@@ -196,8 +197,7 @@ def _possible_detections(
     count, field = len(points), "detections.labels"
     covariances = _array(detections.covariances, "detections.covariances", (count, 2, 2)).astype(np.float64)
     labels = _array(detections.labels, field, (count,), "iu", "integers").astype(np.int_)
-    known = "one of " + ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))
-    _require((labels >= LEFT) & (labels < len(NAMES)), field, known, labels)
+    _require((labels >= LEFT) & (labels < len(NAMES)), field, KNOWN_LABELS, labels)
     if count > most:
         raise ReadingError("detections.points_vehicle", f"at most {most} rows", count)
     ranges, sigmas = (MIN_RANGE, limits.range_max), (MIN_SIGMA, MAX_SIGMA)
@@ -223,12 +223,12 @@ def _possible_detections(
 def _array(
     values: Any, field: str, shape: tuple[int, ...], kinds: str = "fiu", expected: str = "numbers"
 ) -> NDArray[Any]:
-    """Return an array of a required shape, in which -1 matches any length, and kinds of numbers."""
+    """Return an array of kinds of numbers and of a required shape, whose first length may be any (-1)."""
     try:
         array = np.asarray(values)
     except ValueError:
         raise ReadingError(field, "an array", "rows of different lengths") from None
-    if array.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True)):
+    if array.ndim != len(shape) or array.shape[1:] != shape[1:] or shape[0] not in (-1, len(array)):
         raise ReadingError(field, f"the shape {shape}".replace("-1", "m"), f"the shape {array.shape}")
     if array.size and array.dtype.kind not in kinds:
         raise ReadingError(field, expected, array.dtype)

@@ -30,7 +30,7 @@ from pathspace_graph.front_end.measurement import (
     dead_reckoned,
     twist_noise,
 )
-from pathspace_graph.front_end.scan_matching import MIN_MATCHED
+from pathspace_graph.front_end.motion import MATCHING
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import DETECTIONS_FILE, ODOMETRY_FILE, Detections, Log, Odometry, covariances_of
 from pathspace_graph.io.log_files import read_log
@@ -189,8 +189,8 @@ def gaps_and_reach(log: Log) -> list[Hint]:
     found = [hint_of("detections begin late", seconds=begin - t[0])] if early else []
     found += [hint_of("detections end early", seconds=t[-1] - end)] if late else []
     typical = _median(np.array([len(cycle.labels) for cycle in log.cycles]))
-    few = len(log.cycles) >= 100 and typical < MIN_MATCHED
-    return found + ([hint_of("few detections", count=typical, least=MIN_MATCHED)] if few else [])
+    few = len(log.cycles) >= 100 and typical < MATCHING.min_matched
+    return found + ([hint_of("few detections", count=typical, least=MATCHING.min_matched)] if few else [])
 
 
 def positions_in_metres(log: Log) -> tuple[Log, list[Hint]]:
@@ -413,7 +413,7 @@ def side_hints(log: Log) -> list[Hint]:
     lags = []
     for side in (1.0, -1.0):
         cycles = tuple(cycle.where(side * cycle.points_vehicle[:, 1] > 0.0) for cycle in log.cycles)
-        motions = motions_of(replace(log, cycles=cycles), 2000, MIN_MATCHED, fastest=0.0)
+        motions = motions_of(replace(log, cycles=cycles), 2000, MATCHING.min_matched, fastest=0.0)
         if len(motions.rate) < 100:
             return []
         regression = Regression(log.odometry, motions)

@@ -23,14 +23,7 @@ from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import relative
 from pathspace_graph.front_end.measurement import dead_reckoned
-from pathspace_graph.front_end.scan_matching import (
-    FARTHEST,
-    LEAST_SHARE,
-    MIN_DOUBTING,
-    MIN_MATCHED,
-    SCAN_HUBER,
-    SIGMA_CONE,
-)
+from pathspace_graph.front_end.motion import MATCHING
 from pathspace_graph.io.log import Detections, Log, Odometry
 
 Complex = NDArray[np.complex128]
@@ -38,7 +31,7 @@ Complex = NDArray[np.complex128]
 # --- motion by the cones ---------------------------------------------------------------------------------
 
 REACHES: Final = (1.5, 1.2, 0.9, 0.7, 0.5, 0.4, 0.4)  # reach of each step of a registration (m)
-LIMITS: Final = (FARTHEST, 0.5, SCAN_HUBER, SIGMA_CONE, MIN_MATCHED, LEAST_SHARE)  # 0.5: least sum of weights
+REGISTERED: Final = replace(MATCHING, min_weight=0.5)
 APART: Final = 1.7  # distance of further starts of a registration (m), on rings around no motion
 FURTHER: Final = [
     ring * np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -60,7 +53,9 @@ class Motions:
     tried: int  # number of pairs of cycles that were compared
 
 
-def motions_of(log: Log, most: int = 1000, fewest: int = MIN_DOUBTING, fastest: float = 30.0) -> Motions:
+def motions_of(
+    log: Log, most: int = 1000, fewest: int = MATCHING.min_doubting, fastest: float = 30.0
+) -> Motions:
     """Register nearby cycles to each other; the odometry gives only the first of several starts.
 
     About `most` cycles are used, in bursts of successive ones. Further starts are tried up to a speed
@@ -106,8 +101,8 @@ def register(
     for k, start in enumerate(chain(starts, further)):
         if best[0] > (0.75 if k < len(starts) else MATCHED):
             break
-        motion, information, matched, _ = kernels.matched(
-            before.points_vehicle, after.points_vehicle, variances, start, REACHES, LIMITS, (), np.zeros(0)
+        motion, information, matched, *_ = kernels.matched(
+            before.points_vehicle, after.points_vehicle, variances, start, REACHES, REGISTERED
         )
         share = float(matched.sum()) / min(len(before.labels), len(after.labels))
         if matched.sum() >= fewest and share > best[0] + 0.1 * (best[0] > 0.0):

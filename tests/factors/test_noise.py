@@ -133,7 +133,6 @@ def test_the_drift_of_a_twist_depends_on_time_and_not_on_the_rate() -> None:
         twists = np.zeros((len(durations), 3))
         walked = integrate_twists(durations, twists, noise.sigmas(durations)).covariance
         np.testing.assert_allclose(np.diag(walked), noise.drift**2, rtol=1e-6)
-    np.testing.assert_allclose(noise.of_mean(7, 4.0), 0.5 * noise.drift)
 
 
 def test_detections_without_the_constant_errors_of_the_sensor_by_hand() -> None:

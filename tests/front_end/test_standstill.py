@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
-from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.noise import TwistNoise
-from pathspace_graph.factors.se2 import relative, to_map
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import half_square, mean_bias
-from pathspace_graph.front_end.motion import MotionCheck, Standstill
+from pathspace_graph.front_end.motion import MATCHING, MotionCheck
 from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT
@@ -193,60 +192,72 @@ def test_detections_before_other_noise_are_not_compared() -> None:
         assert not any(is_rest(motion) for motion in later)
 
 
-def test_the_gains_are_those_of_the_nearest_detections() -> None:
-    """The kernel's oracle: whitened squares of all pairs, in the frame of each hypothesis."""
-    rng, shares, most, sigma = np.random.default_rng(0), (0.0, 0.25, 0.5, 1.0), 9.0, 0.05
-    points, pose = rng.uniform(-2.0, 8.0, (9, 2)), np.array([0.6, 0.1, 0.05])
-    spread = 0.1 * rng.standard_normal((9, 2, 2))
-    covariances = spread @ spread.transpose(0, 2, 1) + 0.01 * np.eye(2)
-    others = [(points + 0.1 * rng.standard_normal((9, 2)), np.zeros(3)), (points[:4] + 0.2, 0.5 * pose)]
-    expected = []
-    for resting, before in others:
-        way = relative(pose, before)
-        moved, gains = to_map(resting, way[None]), []
-        view = np.hypot(*resting.T).max() - np.hypot(way[0], way[1])
-        for share in shares:
-            off = points[:, None] - (1.0 - share) * resting - share * moved
-            precision = np.linalg.inv(2.0 * covariances + sigma**2 * np.eye(2))
-            squares = np.einsum("mni,mij,mnj->mn", off, precision, off).min(axis=1)
-            gains.append((np.hypot(*points.T) <= view) * np.maximum(most - squares, 0.0))
-        expected.append([*np.sum(gains, axis=1), ((gains[0] - gains[-1]) ** 2).sum()])
-    found = kernels.standstill_gains(points, covariances, pose, others, shares, sigma, most)
-    assert np.min(expected) > 0.0
-    np.testing.assert_allclose(found.T, expected, rtol=1e-9, atol=1e-12)
-    assert kernels.standstill_gains(points, covariances, pose, [], shares, sigma, most).shape == (5, 0)
+class Exact(MotionSettings):
+    """A vehicle that hardly accelerates, so that no latency of the sensor explains a difference."""
+
+    accelerations: ClassVar = (1e-3, 1e-3, 1e-3)
 
 
-GAIN = 9.0
-"""Gain of a detection that matches exactly."""
+def stands(cycles: list[Array], speed: float, limit: float, variance: float = 1e-4) -> bool:
+    """Whether a vehicle stands that sees some points (m, 2) in each cycle, half a second apart.
+
+    By its odometry it drives ahead at a speed (m/s); the limit is in sigmas.
+    """
+    check = MotionCheck(TwistNoise(np.full(3, 1e-3)), Exact(doubt=limit))
+    for k, points in enumerate(cycles):
+        odometry = Odometry(np.array([0.5 * k - 0.5])[: k > 0], np.array([[speed, 0.0, 0.0]])[: k > 0])
+        covariances = np.tile(variance * np.eye(2), (len(points), 1, 1))
+        motion = check.update(odometry, Detections(0.5 * k, points, covariances, np.full(len(points), LEFT)))
+    return is_rest(motion)
+
+
+def likelier(cycles: list[Array], speed: float, variance: float = 1e-4) -> float:
+    """Twice the log-likelihood ratio of standstill to the odometry, by the formula, over all cycles.
+
+    The gain of a detection with the nearest one of an earlier cycle is `max(0, 9 - d^2)`, if that cycle could
+    see it by odometry.
+    """
+    total, precision = 0.0, 1.0 / (2.0 * variance + MATCHING.sigma_cone**2)
+    for k, points in enumerate(cycles):
+        for j, earlier in enumerate(cycles[:k]):
+            way = 0.5 * speed * (k - j)
+            in_view = np.hypot(*points.T) <= np.hypot(*earlier.T).max() - way
+            for sign, moved in ((1.0, earlier), (-1.0, earlier - [way, 0.0])):
+                squares = precision * ((points[:, None] - moved) ** 2).sum(axis=2).min(axis=1)
+                total += sign * (in_view * np.maximum(MATCHING.most_misfit - squares, 0.0)).sum()
+    return 2.0 / len(cycles) * total
+
+
 PLACES = np.column_stack([np.linspace(1.0, 6.0, 10), np.tile([-1.8, 1.8], 5)])
 """Ten cones, none of which a motion of 0.7 or 1.4 m along x, or a part of it, moves onto another one."""
 
 
-def stands(points: Array, cycles: int, odometry: Array) -> Standstill:
-    """A vehicle that sees the same points in each cycle, half a second apart, while its odometry moves."""
-    standstill, covariances = Standstill(), np.tile(1e-4 * np.eye(2), (len(points), 1, 1))
-    for k in range(cycles):
-        standstill.add(0.5 * k, points, covariances, odometry if k else np.zeros(3), k * odometry)
-    return standstill
-
-
 def test_three_cycles_count_as_two_thirds_of_their_three_pairs() -> None:
     """Ten cones match exactly in three pairs of cycles, where by odometry none of them does."""
-    far = np.array([[30.0, 0.0]])  # so that the others are in view
-    points, step = np.concatenate([PLACES, far]), np.array([1.3, 0.0, 0.0])
-    twice = 2.0 / 3.0 * 3.0 * 10.0 * GAIN
-    assert stands(points, 3, step).by_cones(np.sqrt(0.98 * twice)) is not None
-    assert stands(points, 3, step).by_cones(np.sqrt(1.02 * twice)) is None
+    cycles = 3 * [np.concatenate([PLACES, [[30.0, 0.0]]])]  # the last one, so that the others are in view
+    twice = 2.0 / 3.0 * 3.0 * 10.0 * MATCHING.most_misfit
+    assert likelier(cycles, 2.6) == pytest.approx(twice)
+    assert stands(cycles, 2.6, np.sqrt(0.98 * twice))
+    assert not stands(cycles, 2.6, np.sqrt(1.02 * twice))
 
 
 def test_only_what_the_other_cycle_could_see_says_that_the_vehicle_stands() -> None:
     """By an odometry of 1.3 m a cycle, the last cones were beyond the view of one or two cycles before."""
-    step, ranges = np.array([1.3, 0.0, 0.0]), np.hypot(*PLACES.T)
-    once, twice = ((ranges <= ranges.max() - k * 1.3).sum() for k in (1, 2))
-    assert 10 > once > twice > 0
-    likelier = 2.0 / 3.0 * (2 * once + twice) * GAIN
-    assert stands(PLACES, 3, step).by_cones(np.sqrt(1.02 * likelier)) is None
+    cycles = 3 * [PLACES]
+    assert likelier(cycles, 2.6) < 0.9 * likelier(3 * [np.concatenate([PLACES, [[30.0, 0.0]]])], 2.6)
+    assert not stands(cycles, 2.6, np.sqrt(1.02 * likelier(cycles, 2.6)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_likelihood_of_a_standstill_is_that_of_the_nearest_detections(seed: int) -> None:
+    """Twelve cones at random places, seen with 5 cm of noise."""
+    rng = np.random.default_rng(seed)
+    cones = np.column_stack([rng.uniform(0.5, 9.0, 12), rng.uniform(-4.0, 4.0, 12)])
+    far = np.array([[0.0, 30.0]])
+    cycles = [np.concatenate([cones + 0.05 * rng.standard_normal(cones.shape), far]) for _ in range(3)]
+    twice = likelier(cycles, 2.9, 0.0025)
+    assert stands(cycles, 2.9, np.sqrt(0.99 * twice), 0.0025)
+    assert not stands(cycles, 2.9, np.sqrt(1.01 * twice), 0.0025)
 
 
 def test_an_odometry_that_is_always_believed_is_believed_here() -> None:
@@ -254,17 +265,18 @@ def test_an_odometry_that_is_always_believed_is_believed_here() -> None:
     assert not any(motion.fault for motion in motions(true, true + 1.3, 0, check=check))
 
 
-@pytest.mark.parametrize(("speed", "stands"), [(2.0, True), (4.0, False)])
+@pytest.mark.parametrize(("speed", "is_compared"), [(2.0, True), (4.0, False)])
 def test_wheels_that_turn_faster_than_a_creep_are_not_compared_with_earlier_cycles(
-    speed: float, stands: bool
+    speed: float, is_compared: bool
 ) -> None:
     """The same cones are seen for a second, during which odometry tells a speed in the last cycle alone."""
-    standstill, points = Standstill(), rows(np.random.default_rng(0))
-    covariances = np.tile(0.01 * np.eye(2), (len(points), 1, 1))
+    points, check = rows(np.random.default_rng(0)), MotionCheck(TwistNoise(TWIST_SIGMA), MotionSettings())
     for k in range(11):
-        delta = np.array([PERIOD * speed if k == 10 else 0.0, 0.0, 0.0])
-        standstill.add(PERIOD * k, points, covariances, delta, np.zeros(3))
-    assert (standstill.by_cones(1.0) is not None) is stands
+        twists = np.array([[speed if k == 10 else 0.0, 0.0, 0.0]])
+        covariances = np.tile(0.01 * np.eye(2), (len(points), 1, 1))
+        cycle = Detections(PERIOD * k, points, covariances, np.full(len(points), LEFT))
+        motion = check.update(Odometry(np.array([PERIOD * (k - 1)]), twists), cycle)
+    assert is_rest(motion) is is_compared
 
 
 # --- by the twists ------------------------------------------------------------------------------------------
@@ -302,6 +314,14 @@ def test_the_bias_is_measured_and_the_vehicle_does_not_move(log: Log) -> None:
     late = [m for m, c in zip(motions, log.cycles, strict=True) if c.t > REST + 1.0]
     assert not any(motion.bias for motion in late)
     assert all(motion.odometry.delta[0] > 0.1 for motion in late)
+
+
+def test_a_bias_is_as_uncertain_as_noise_and_drift_of_its_second(log: Log) -> None:
+    """The first twist of a cycle repeats one, so that 40 count."""
+    check = MotionCheck(TwistNoise(log.odometry_sigma, np.full(3, 0.01)), MotionSettings())
+    motions = (check.update(odometry, cycle) for odometry, cycle in split_odometry(log))
+    bias = next(motion.bias for motion in motions if motion.bias is not None)
+    assert bias.sigma == pytest.approx(np.hypot(0.035 / np.sqrt(40.0), 0.01), rel=1e-3)
 
 
 @pytest.mark.parametrize("make", [FixedLagMapper, LandmarkFixedLag])
@@ -349,12 +369,14 @@ def test_the_motion_in_which_a_rest_ends_may_have_missed_the_start(log: Log) -> 
 
 
 def test_a_vehicle_that_creeps_is_not_at_rest() -> None:
-    rest, rng = Standstill(), np.random.default_rng(0)
-    told = []
+    """Its detections agree with a rest, too, as 3 cm a cycle are below their noise."""
+    rng, told = np.random.default_rng(0), list[bool]()
+    cones, check = rows(rng), MotionCheck(TwistNoise(SIGMA), MotionSettings())
     for k in range(40):
-        t = 0.1 * k + 0.02 * np.arange(5)
+        stamps = 0.1 * k + 0.02 * np.arange(5)
         twist = np.array([0.3, 0.0, 0.0]) + SIGMA * rng.standard_normal((5, 3))
-        told.append(rest.by_twists(Odometry(t, twist), 0.1 * (k + 1), TwistNoise(SIGMA)))
+        seen = cones[(cones[:, 0] > 1.0 + 0.03 * k) & (cones[:, 0] < 12.0)] - [0.03 * k, 0.0]
+        told.append(check.update(Odometry(stamps, twist), see(0.1 * (k + 1), seen, rng)).rests)
     assert not any(told[12:])
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import is_dataclass
 from functools import cached_property
@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.factors._kernels import RowStore
+from pathspace_graph.factors._kernels import MotionCheck, RowStore
 from pathspace_graph.front_end.gate import Gate
 
 NOT_ESTIMATED = (
@@ -22,6 +22,13 @@ NOT_ESTIMATED = (
     *("_first_pose", "_curves", "_whole_curves"),
 )
 """These attributes are times of the machine, what is kept for a failure, and caches."""
+
+COMPILED: dict[type, Callable[[Any], Any]] = {
+    KDTree: lambda tree: np.array(tree.data),
+    RowStore: RowStore.parts,
+    MotionCheck: lambda check: (check.pose, check.errors),  # every cycle changes its errors of the sensor
+}
+"""What each compiled object holds."""
 
 
 def digest(estimator: object) -> str:
@@ -43,7 +50,9 @@ def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
     elif isinstance(value, list | tuple | deque | set | frozenset):
         for entry in sorted(value) if isinstance(value, set | frozenset) else value:
             yield from _parts(entry, seen)
-    elif type(value).__module__.startswith("pathspace_graph") and not isinstance(value, Gate | RowStore):
+    elif type(value).__module__.startswith("pathspace_graph") and not isinstance(
+        value, Gate | MotionCheck | RowStore
+    ):
         if _is_frozen(value) or id(value) not in seen:
             seen.add(id(value))
             yield type(value).__qualname__.encode()
@@ -53,8 +62,8 @@ def _parts(value: Any, seen: set[int]) -> Iterator[bytes]:
             yield from _parts(value.at(k), seen)
     elif isinstance(value, gtsam.GaussianFactor):
         yield repr(list(value.keys())).encode() + value.augmentedInformation().tobytes()
-    elif isinstance(value, KDTree | RowStore):
-        yield from _parts(np.array(value.data) if isinstance(value, KDTree) else value.parts(), seen)
+    elif isinstance(value, tuple(COMPILED)):
+        yield from _parts(COMPILED[type(value)](value), seen)
     elif not isinstance(value, Gate | Future):
         yield repr(value).encode()
 

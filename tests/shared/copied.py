@@ -8,7 +8,7 @@ from typing import Any, Final
 import gtsam
 import numpy as np
 
-from pathspace_graph.factors._kernels import RowStore
+from pathspace_graph.factors._kernels import MotionCheck, RowStore
 
 Memo = dict[int, Any]  # copies by the `id` of what they are copies of
 
@@ -36,7 +36,7 @@ def _copy_of(value: Any, memo: Memo) -> Any:
         graph = type(value)()
         graph.push_back(value)
         return graph
-    if isinstance(value, RowStore):
+    if isinstance(value, MotionCheck | RowStore):
         return value.copy()
     is_own = hasattr(value, "__dict__") and type(value).__module__.startswith("pathspace_graph.")
     return _object(value, memo) if is_own and not isinstance(value, str) else value
