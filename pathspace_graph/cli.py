@@ -38,19 +38,19 @@ class Entry(NamedTuple):
 
 GROUPS: Final = {
     "Maps": {
-        "demo": Entry("runs:Demo", "compare", "Map a generated track online: a table, a map, its picture."),
+        "demo": Entry("runs:Demo", "studies", "Map a generated track online: a table, a map, its picture."),
         "online": Entry("runs:Online", "estimate", "Map a log online, cycle by cycle."),
         "batch": Entry("runs:Batch", "estimate", "Optimize whole logs at once, as the ground reference."),
-        "plot": Entry("runs:Plot", "plot", "Draw a map with its uncertainty band."),
-        "view": Entry("runs:View", "view", "Write a result as a page for any browser."),
-        "export": Entry("runs:Export", "export", "Write a map as planners and other tools read it."),
+        "plot": Entry("runs:Plot", "pictures", "Draw a map with its uncertainty band."),
+        "view": Entry("runs:View", "pictures", "Write a result as a page for any browser."),
+        "export": Entry("runs:Export", "data", "Write a map as planners and other tools read it."),
     },
     "Data": {
-        "simulate": Entry("data:Simulate", "simulate", "Write the log of a simulated drive, with truth."),
-        "convert": Entry("data:Convert", "convert", "Write a ROS bag, CSV files or JSON lines as a log."),
+        "simulate": Entry("data:Simulate", "data", "Write the log of a simulated drive, with truth."),
+        "convert": Entry("data:Convert", "data", "Write a ROS bag, CSV files or JSON lines as a log."),
     },
     "Studies": {
-        "compare": Entry("runs:Compare", "compare", "Run every estimator on logs: the paper's table."),
+        "compare": Entry("runs:Compare", "studies", "Run every estimator on logs: the paper's table."),
         "ablate": Entry("runs:Ablate", "studies", "Run a study of estimators and settings."),
         "faults": Entry("runs:FaultSuite", "studies", "Measure what each fault of a car costs."),
         "scale": Entry("runs:Scale", "studies", "Measure update time against map size."),

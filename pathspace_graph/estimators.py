@@ -13,9 +13,9 @@ from typing import Any, Final
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.overrides import override
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.online.fixed_lag import FixedLagMapper
+from pathspace_graph.settings.checked import override
 from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
 from .errors import SettingsError, check_name, check_type
@@ -71,7 +71,7 @@ def _baseline(name: str, place: str) -> Elsewhere:
 ONLINE: Final[dict[str, MakeOnline]] = {
     **_installed(ONLINE_GROUP),
     DEFAULT_ONLINE: FixedLagMapper,
-    "landmark-fixed-lag": _baseline("landmark-fixed-lag", "landmark_fixed_lag:LandmarkFixedLag"),
+    "landmark-fixed-lag": _baseline("landmark-fixed-lag", "landmark_graph:LandmarkFixedLag"),
     "ckf": _baseline("ckf", "filters:CkfMapper"),
     "landmark-ckf": _baseline("landmark-ckf", "filters:LandmarkCkf"),
 }
@@ -79,7 +79,7 @@ ONLINE: Final[dict[str, MakeOnline]] = {
 BATCH: Final[dict[str, MakeBatch]] = {
     **_installed(BATCH_GROUP),
     DEFAULT_BATCH: lambda settings, noise: BatchMapper(settings, noise, FixedLagMapper),
-    "landmark-batch": _baseline("landmark-batch", "landmark_batch:LandmarkBatch"),
+    "landmark-batch": _baseline("landmark-batch", "landmark_graph:LandmarkBatch"),
 }
 
 

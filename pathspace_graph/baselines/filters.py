@@ -25,14 +25,20 @@ from pathspace_graph.places.passes import tried_along
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
-from pathspace_graph.spline.bspline import BSpline, sparse_rows
-from pathspace_graph.spline.knots import SAMPLED_WEIGHT, LeastSquares
+from pathspace_graph.spline.bspline import SAMPLED_WEIGHT, BSpline, LeastSquares, sparse_rows
 
-from .ckf_belief import HEAD, Belief, point_columns, transform
-from .ckf_curves import CurveState, Expansion, classify, in_map, update
-from .landmark_association import ROUGH_GATE, assign, compatible, pair_costs
-from .landmark_map import UNASSOCIATED, landmark_counts, point_map
-from .online import FRONT_END, OnlineBaseline
+from .ckf import HEAD, Belief, CurveState, Expansion, classify, in_map, point_columns, transform, update
+from .landmarks import (
+    FRONT_END,
+    ROUGH_GATE,
+    UNASSOCIATED,
+    OnlineBaseline,
+    assign,
+    compatible,
+    landmark_counts,
+    pair_costs,
+    point_map,
+)
 
 JOIN_MARGIN: Final = 10.0  # with `BEGINNING`, largest distance of the seam from the end of a curve (m)
 JOIN_SHARE: Final = 0.5  # least parameter of the seam on a short curve, as a share of its length

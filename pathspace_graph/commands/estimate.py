@@ -1,9 +1,10 @@
 """`online` and `batch`: map a log cycle by cycle, without reading ahead, or optimize it at once."""
 
+import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from itertools import count
@@ -28,10 +29,9 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.graph.exchange import GRAPH_FILE, write_graph
 from pathspace_graph.health import DEGRADED, LOST, counts
-from pathspace_graph.io.files import atomic_file, check_target
+from pathspace_graph.io.files import atomic_file, check_target, to_plain
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map, as_ribbon, read_map
-from pathspace_graph.io.overrides import override
 from pathspace_graph.io.results import BatchRun, RunResult, write_result
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
@@ -40,14 +40,32 @@ from pathspace_graph.options.runs import Batch, MapKind, Online, Plot
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
 from pathspace_graph.plausibility.judge import Hint, objections, read_plausible_log
 from pathspace_graph.run import Observer, OnlineEstimator, run_online, with_own
+from pathspace_graph.settings.checked import override
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import EVENTS
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.spline.boundary import crossings_told
 
-from .outcome import Outcome
-
 Run = TypeVar("Run", bound=RunResult)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The end of a command."""
+
+    written: Sequence[Path]
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    wrong: Sequence[str] = ()  # a line each, and exit code 3; empty for a trustworthy result
+
+    def show(self, *, as_json: bool) -> None:
+        """Print the summary as JSON, or the paths of the files; objections go to standard error."""
+        files = [path for path in self.written if path.is_file() or path.is_dir()]  # no pipe or terminal
+        if as_json and (files or self.summary):
+            content = to_plain({**self.summary, "written": files, "wrong": self.wrong})
+            print(json.dumps(content, indent=2, allow_nan=False))
+        elif files:
+            say(f"written to {', '.join(map(str, files))}")
+        note(*self.wrong)
 
 
 def read_known_map(path: Path, sigma: float, settings: MapperSettings) -> tuple[Map, Array | None]:
@@ -82,7 +100,7 @@ def online_command(options: Online) -> Outcome:
     known = None if options.on is None else read_known_map(options.on, options.map_sigma, options.settings)
     drawing = viewing = None
     if options.plot is not None:  # importing matplotlib is slow
-        drawing = import_module("pathspace_graph.commands.plot")
+        drawing = import_module("pathspace_graph.commands.pictures")
         drawing.check_picture(options.plot)
     if options.view or options.save_view is not None:
         viewing = import_module("pathspace_graph.eval.view.recording")

@@ -18,7 +18,7 @@ from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_STAMP
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.settings.mapper import LimitSettings
 
 from .messages import ALONE, Points
 from .settings import LEAST_SPACING, Frames, NoiseSettings, Window

@@ -27,7 +27,7 @@ from pathspace_graph.io.log import (
 )
 from pathspace_graph.labels import LEFT, NAMES
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.settings.mapper import LimitSettings
 
 TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
 LATEST_STAMP: Final = 1e11  # largest stamp (s), 3000 years: stamps in nanoseconds are larger

@@ -13,7 +13,7 @@ from pathspace_graph.factors.odometry import integrate_twists, integrated_odomet
 from pathspace_graph.factors.se2 import compose, relative
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
-from pathspace_graph.settings.online import MotionSettings
+from pathspace_graph.settings.mapper import MotionSettings
 
 from .scan_matching import (
     MIN_DOUBTING,

@@ -20,7 +20,7 @@ from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR, by_sensor
 from pathspace_graph.io.log import Detections
-from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
+from pathspace_graph.settings.mapper import CalibrationSettings, MotionSettings
 
 # --- points of lines -------------------------------------------------------------------------------------
 

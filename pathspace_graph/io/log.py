@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pathspace_graph.brief import Brief, Shown, pictures
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
@@ -19,7 +20,6 @@ from pathspace_graph.labels import NAMES, UNKNOWN, Kind, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
 
 from . import parsing as limits
-from .brief import Brief, Shown, pictures
 from .parsing import Column, Table
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from scipy.linalg import block_diag
 
+from pathspace_graph.brief import Brief, Shown, pictures
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import move_points, rotation
@@ -20,7 +21,6 @@ from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.centre_line import find_line
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
-from .brief import Brief, Shown, pictures
 from .parsing import MAX_COORDINATE, read_json, shown, typed
 
 if TYPE_CHECKING:

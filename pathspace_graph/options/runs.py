@@ -8,10 +8,16 @@ from typing import Annotated, Any, Final, Literal
 
 from cyclopts import Group, Parameter
 
-from pathspace_graph.settings.checked import Checked
-from pathspace_graph.settings.evaluation import ScalingSettings
-from pathspace_graph.settings.mapper import BATCH_NAMES, ONLINE_NAMES, MapperSettings, Start
-from pathspace_graph.settings.output import SpeedSettings
+from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.settings.checked import Checked, apart, flatten, override
+from pathspace_graph.settings.mapper import (
+    BATCH_NAMES,
+    ONLINE_NAMES,
+    MapperSettings,
+    ScalingSettings,
+    SpeedSettings,
+    Start,
+)
 
 INLINE: Final = Parameter(name="*")
 """Settings whose options have no prefix."""
@@ -76,10 +82,22 @@ class Estimation(Command):
 
 
 def _read_settings(file: Path, estimators: Iterable[str]) -> tuple[MapperSettings, dict[str, Any]]:
-    overrides = import_module("pathspace_graph.io.overrides")  # the help need not wait for NumPy
-    found: tuple[MapperSettings, dict[str, Any]]
-    found = overrides.read_settings(file, MapperSettings(), estimators)
-    return found
+    """Settings with those of a file, and the own parameters of some estimators that it has.
+
+    The file is TOML or a run's `summary.json`. An InputError says what is wrong with the settings.
+    """
+    parsing = import_module("pathspace_graph.io.parsing")  # the help need not wait for NumPy
+    text = parsing.read_text(file, "a file of settings", parsing.MAX_HEADER_BYTES)
+    content = (parsing.parse_json if file.suffix == ".json" else parsing.parse_toml)(text, file)
+    table = content.get("settings", content) if isinstance(content, dict) else content
+    if not isinstance(table, dict):
+        raise InputError(file, f"expected a table of settings, found {parsing.shown(table)}")
+    defaults = MapperSettings()
+    try:
+        overrides, own = apart(flatten(table), estimators, defaults)
+        return override(defaults, overrides, ""), own
+    except SettingsError as error:
+        raise InputError(file, str(error)) from error
 
 
 @dataclass(frozen=True, kw_only=True)

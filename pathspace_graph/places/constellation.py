@@ -22,7 +22,7 @@ from pathspace_graph.factors.se2 import (
 from pathspace_graph.labels import BOUNDARIES, UNKNOWN
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.tracks import Tracks
-from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.settings.mapper import GrowthSettings
 from pathspace_graph.spline.bspline import BSpline
 
 FIT_SIGMA: Final = 0.25  # standard deviation added to a cone's covariance, for slow errors of the sensor (m)

@@ -17,7 +17,7 @@ from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.se2 import left_of, path_lengths, to_vehicle, wrap_angle
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.settings.output import SpeedSettings
+from pathspace_graph.settings.mapper import SpeedSettings
 
 from .bspline import BSpline, cross, dot, sparse_rows
 from .centre_line import (

@@ -12,7 +12,7 @@ import pytest
 from scipy.interpolate import BSpline as ScipyBSpline
 
 from pathspace_graph import __main__ as program
-from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
+from pathspace_graph.baselines.landmark_graph import LandmarkFixedLag
 from pathspace_graph.batch import optimizer
 from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.commands import estimate as commands_estimate
@@ -257,7 +257,7 @@ def test_plot_draws_a_map_with_its_log(log_folder: Path, map_folder: Path, tmp_p
 def test_demo_shows_the_table_and_leaves_log_map_and_picture(
     log_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pathspace_graph.commands.compare.simulate", lambda *_: read_log(log_folder))
+    monkeypatch.setattr("pathspace_graph.commands.studies.simulate", lambda *_: read_log(log_folder))
     monkeypatch.chdir(tmp_path)
     assert main(["demo"]) == 0
     (tmp_path / "pathspace-demo" / "track.png").write_text("of an earlier demo")

@@ -15,8 +15,8 @@ import pytest
 
 from pathspace_graph.cli import BROKEN_PIPE, main, parse
 from pathspace_graph.io.files import write_json
-from pathspace_graph.io.overrides import leaves
 from pathspace_graph.options.help import ESSENTIAL
+from pathspace_graph.settings.checked import leaves
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 from pathspace_graph.sim.simulate import PRESETS, SimulationSettings
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.commands.convert import with_measured_noise
+from pathspace_graph.commands.data import with_measured_noise
 from pathspace_graph.convert import recording
 from pathspace_graph.convert.recording import strays
 from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.plausibility.judge import read_plausible_log
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.settings.mapper import LimitSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 

@@ -21,7 +21,7 @@ from pathspace_graph.front_end.scan_matching import (
     ScanMatcher,
     Seen,
 )
-from pathspace_graph.settings.online import MotionSettings
+from pathspace_graph.settings.mapper import MotionSettings
 
 from ..scenes.drives import detections
 from ..scenes.jacobians import numeric_jacobian

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
+from pathspace_graph.baselines.landmark_graph import LandmarkFixedLag
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.factors.se2 import relative, to_map
@@ -21,8 +21,7 @@ from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online, split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import MotionSettings
+from pathspace_graph.settings.mapper import MapperSettings, MotionSettings
 from pathspace_graph.sim.faults import Faults, OdometryFaults
 from pathspace_graph.sim.sensor import OdometryNoise
 from pathspace_graph.sim.simulate import SimulationSettings, simulate

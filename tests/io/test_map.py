@@ -27,8 +27,7 @@ from pathspace_graph.io.map import (
     read_map,
 )
 from pathspace_graph.labels import BOUNDARIES, LEFT, ORANGE, RIGHT
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import fit_spline
+from pathspace_graph.spline.bspline import BSpline, fit_spline
 
 from ..scenes.maps import SIGMA, open_map, ring_map
 

@@ -7,9 +7,9 @@ import pytest
 
 from pathspace_graph.eval.metrics.accuracy import closest_points
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import (
+from pathspace_graph.spline.bspline import (
     ENERGY_WEIGHT,
+    BSpline,
     chosen_breaks,
     energy_rows,
     fewest_breaks,

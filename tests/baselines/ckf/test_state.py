@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.baselines.ckf_belief import HEAD, Belief
-from pathspace_graph.baselines.ckf_curves import SIGMA_START, CurveState
+from pathspace_graph.baselines.ckf import HEAD, SIGMA_START, Belief, CurveState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.bspline import BSpline

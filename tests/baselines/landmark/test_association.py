@@ -9,9 +9,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_association import (
+from pathspace_graph.baselines.landmarks import (
+    AMBIGUOUS,
     CREATE_GATE,
     MATCH_GATE,
+    UNASSOCIATED,
     assign,
     associate_created,
     associate_newest,
@@ -21,11 +23,10 @@ from pathspace_graph.baselines.landmark_association import (
     predicted_points,
     squared_mahalanobis,
 )
-from pathspace_graph.baselines.landmark_map import AMBIGUOUS, UNASSOCIATED
 from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.settings.mapper import GrowthSettings
 
 from ...scenes.drives import detections
 from .scenes import SPEED, drive_on, driven, with_covariance

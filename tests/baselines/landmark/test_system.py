@@ -8,7 +8,7 @@ import pytest
 from gtsam.symbol_shorthand import C, L, X
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_map import UNASSOCIATED, LandmarkSystem, solve_landmarks, start_oracle
+from pathspace_graph.baselines.landmarks import UNASSOCIATED, LandmarkSystem, solve_landmarks, start_oracle
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.io.log import Log

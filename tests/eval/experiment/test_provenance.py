@@ -24,8 +24,8 @@ from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.study import Study, read_study_file
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import PointBoundary, read_map
-from pathspace_graph.io.overrides import leaves
 from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.checked import leaves
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ...scenes.drives import noisy_lap

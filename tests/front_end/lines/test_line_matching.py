@@ -30,8 +30,7 @@ from pathspace_graph.front_end.scan_matching import (
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import MotionSettings
+from pathspace_graph.settings.mapper import MapperSettings, MotionSettings
 
 from ...scenes.drives import detections
 from ...scenes.lines import line_drive

@@ -1,32 +1,42 @@
-"""The Hungarian landmark graph online: cones are points in the same fixed-lag smoother as the curves.
+"""The Hungarian landmark graph: cones are points in the same fixed-lag smoother as the curves, or in a batch.
 
 The loop closes when enough of the recent landmarks are landmarks of the beginning. Their joint covariance
 tests a set of pairs as a whole (joint compatibility, Neira and Tardos 2001).
 """
 
+from dataclasses import replace
+from itertools import pairwise
 from typing import ClassVar, Final
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from pathspace_graph.batch.association import insert_drive
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.residuals import chi2_quantile
+from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
 from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.graph.elimination import Elimination
 from pathspace_graph.graph.smoother import FixedLagSmoother, restart, set_prior
-from pathspace_graph.graph.variables import ONE_DRIVE, POINT
+from pathspace_graph.graph.variables import ONE_DRIVE, POINT, POSE
+from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import VehicleState
+from pathspace_graph.io.results import BatchRun, VehicleState
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.laps import LapCounter
 from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.mapping import motion as motions
-from pathspace_graph.mapping.motion import predict, vehicle_state
+from pathspace_graph.mapping.motion import known_noise, predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.tracks import FORGET_AFTER, Tracks, nearest_within
-from pathspace_graph.run import CycleResult, Readings, Stopwatch
+from pathspace_graph.run import CycleResult, Readings, Stopwatch, settings_dict, solved, split_odometry
+from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
-from . import landmark_association as association
-from .landmark_association import CREATE, MATCH_GATE, difference_covariances
-from .landmark_map import (
+from .landmarks import (
+    CREATE,
+    FRONT_END,
+    MATCH_GATE,
+    ROUGH_GATE,
     SIGMA_MERGE,
     UNASSOCIATED,
     LandmarkDetections,
@@ -34,10 +44,19 @@ from .landmark_map import (
     LandmarkSmoother,
     LandmarkState,
     LandmarkSystem,
+    OnlineBaseline,
+    assign,
+    associate_created,
+    associate_newest,
+    compatible,
+    difference_covariances,
+    find_duplicates,
+    hysteresis_costs,
     landmark_counts,
+    merge,
     point_map,
+    squared_mahalanobis,
 )
-from .online import FRONT_END, OnlineBaseline
 
 UNSEEN_PATH: Final = 40.0  # path without a detection after which a landmark is old (m)
 PRIOR_SCALE: Final = 1.5  # factor of the sigmas of the vehicle and the landmarks, which are too certain
@@ -81,7 +100,7 @@ class LandmarkFixedLag(OnlineBaseline):
         eligible = np.ones(len(state), bool)
         if not self.closed and self._near_start():  # a single detection of an old landmark is ambiguous
             eligible = ~self._old()
-        association.associate_newest(smoother, new, eligible)
+        associate_newest(smoother, new, eligible)
         watch.lap("associate")
         created = self._create(new, detections.t)
         watch.lap("create")
@@ -123,9 +142,7 @@ class LandmarkFixedLag(OnlineBaseline):
             points = tentative.points[confirmed].copy()
             rows = np.flatnonzero((detections.label == label) & (detections.landmark == UNASSOCIATED))
             points_map = detections.points_map(rows, variables)
-            chosen, landmark = association.associate_created(
-                points_map, detections.cycle[rows], points, growth
-            )
+            chosen, landmark = associate_created(points_map, detections.cycle[rows], points, growth)
             held, landmark = np.unique(landmark, return_inverse=True)
             numbers = state.add(points[held], np.full(len(held), label, np.intp))[landmark]
             detections.take(rows[chosen], numbers)
@@ -170,9 +187,7 @@ class LandmarkFixedLag(OnlineBaseline):
             return
         self._last_check = length
         if self.closed:
-            self._merge(
-                *association.find_duplicates(state, len(state), self.smoother.last_covariance, self.settings)
-            )
+            self._merge(*find_duplicates(state, len(state), self.smoother.last_covariance, self.settings))
         elif self._near_start() and self.record.unsolvable is None:
             reach = self.settings.closing.radius_after(length)
             recent, old = state.positions(detected), np.flatnonzero(self._old())
@@ -201,7 +216,7 @@ class LandmarkFixedLag(OnlineBaseline):
         if len(gone):
             numbers = self.smoother.map.state.numbers
             np.maximum.at(self._last_detected, numbers[kept], self._last_detected[numbers[gone]])
-            association.merge(self.smoother, gone, kept)
+            merge(self.smoother, gone, kept)
 
     def _map(self, with_covariance: bool) -> Map:
         state = self.smoother.map.state
@@ -241,7 +256,7 @@ class JointCompatibility:
         """Squared Mahalanobis distances (k, n) of all pairs, infinite for different labels."""
         k = len(self.recent)
         spread = difference_covariances(covariance, np.arange(k)[:, None], np.arange(k, len(mean)))
-        squared = association.squared_mahalanobis(mean[:k, None] - mean[None, k:], spread)
+        squared = squared_mahalanobis(mean[:k, None] - mean[None, k:], spread)
         return np.where(self.same_label, squared, np.inf)
 
     def conditioned(self, mean: Array, covariance: Array, i: int, j: int) -> tuple[Array, Array]:
@@ -297,3 +312,131 @@ def detect_loop(
     enough = all((labels == label).sum() >= MIN_PAIRS // 3 for label in BOUNDARIES)
     fits = distance < chi2_quantile(CREATE, POINT * len(labels))
     return (recent[i], old[j]) if enough and len(labels) >= MIN_PAIRS and fits else None
+
+
+# --- the Hungarian landmark graph over a whole log: all poses and landmarks, with iterated associations -
+
+
+class LandmarkBatch:
+    """Maps cones as points with all poses of a log, from the online run of `LandmarkFixedLag` on."""
+
+    READS: ClassVar = LandmarkFixedLag.READS
+
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
+        self.settings = known_settings(settings)
+        self.odometry_sigma = odometry_sigma
+        known_noise(odometry_sigma)  # check it early
+
+    def solve(self, log: Log) -> BatchRun:
+        return solved(self._solve, log)
+
+    def _solve(self, log: Log) -> BatchRun:
+        """Optimize the map of the online run, and associate anew until hardly any detection changes."""
+        noise = known_noise(self.odometry_sigma)
+        system = LandmarkSystem.of_log(log, self.settings, noise)
+        online = LandmarkFixedLag(system.settings, noise)
+        for odometry, cycle in split_odometry(log):
+            online.update(odometry, cycle)
+        detections, state = system.detections, online.whole_drive(system.detections)
+        sigma = np.array(online.inflated.odometry.sigmas)  # priors at the end of the online run
+        chain = replace(system.chain, calibration_sigma=sigma)
+        system = replace(system, settings=online.inflated, chain=chain)
+        system.optimize(state)
+        converged, rounds = False, 0
+        while not converged and rounds < 10:
+            before, known, problem = detections.landmark.copy(), len(state), system.eliminated(state)
+            reassociate(system, state, problem, self.settings)
+            gone, kept = find_duplicates(state, known, problem.joint, self.settings)
+            detections.merge(state.numbers[gone], state.numbers[kept])
+            remove_rare(state, detections, self.settings.growth.sightings)
+            converged = int((before != detections.landmark).sum()) <= 1e-3 * len(detections)
+            system.optimize(state)
+            rounds += 1
+        laps, problem, poses = LapCounter(), system.eliminated(state), state.variables.poses.copy()
+        for pose in poses:
+            laps.update(pose)
+        return BatchRun(
+            estimator="landmark-batch",
+            settings=settings_dict(self.settings),
+            map=point_map(state.landmarks, state.labels, problem.joint(state.keys), laps.completed > 0),
+            trajectory_t=system.chain.stamps,
+            trajectory=poses,
+            cycles=(),
+            laps=laps.completed,
+            converged=converged,
+            noise=system.noise,
+        )
+
+
+def reassociate(
+    system: LandmarkSystem, state: LandmarkState, problem: Elimination, settings: MapperSettings
+) -> None:
+    """Assign the detections of every cycle once more, by the covariances of the eliminated problem.
+
+    Each landmark takes the label of most detections in its gate. Detections that no landmark explains create
+    landmarks, at tracks with enough of them.
+    """
+    detections, stamps, growth = system.detections, system.chain.stamps, settings.growth
+    points_map = detections.points_map(slice(None), state.variables)
+    pairs = KDTree(points_map).sparse_distance_matrix(
+        KDTree(state.landmarks), ROUGH_GATE, output_type="coo_matrix"
+    )
+    order = np.argsort(pairs.row, kind="stable")
+    rows, landmarks = pairs.row[order].astype(np.intp), pairs.col[order].astype(np.intp)
+    cycles = detections.cycle[rows]
+    poses = state.variables.poses_at(cycles)
+    r = landmark_residuals(poses, state.landmarks[landmarks], detections.point[rows])
+    jacobian = np.concatenate([r.by_pose, r.by_landmark], axis=2)
+    spread = predicted_covariances(problem, cycles, state.keys[landmarks], jacobian)
+    cost = squared_mahalanobis(r.residual, spread + detections.covariance[rows])
+    held = detections.landmark[rows] == state.numbers[landmarks]
+    cost = hysteresis_costs(cost, held)
+    inside = cost < MATCH_GATE
+    state.votes = np.zeros_like(state.votes)
+    state.vote(detections.label[rows[inside]], state.numbers[landmarks[inside]])
+    detections.landmark[:] = UNASSOCIATED
+    free = np.ones(len(detections), bool)
+    starts = np.searchsorted(cycles, np.arange(len(stamps) + 1))
+    for begin, end in pairwise(starts.tolist()):
+        detected, i = np.unique(rows[begin:end], return_inverse=True)
+        candidates, j = np.unique(landmarks[begin:end], return_inverse=True)
+        table = np.full((len(detected), len(candidates)), np.inf)
+        table[i, j] = cost[begin:end]
+        same_label = compatible(detections.label[detected], state.labels[candidates])
+        table[~same_label] = np.inf
+        landmark, free[detected] = assign(table)
+        matched = landmark != UNASSOCIATED
+        detections.take(detected[matched], state.numbers[candidates[landmark[matched]]])
+    # do not create landmarks that one with another label explains, or that would be merged
+    free[rows[inside | (pairs.data[order] < growth.merge_radius)]] = False
+    new = np.flatnonzero(free & ~detections.used)
+    covariances = detections.covariances_map(new, state.variables)
+    tracks = Tracks(growth.merge_radius, np.inf)
+    tracks.add(points_map[new], covariances, detections.label[new], stamps[detections.cycle[new]])
+    for label in BOUNDARIES:
+        rows = new[detections.label[new] == label]
+        points = tracks.points[tracks.confirmed(label, growth.sightings)]
+        chosen, landmark = associate_created(points_map[rows], detections.cycle[rows], points, growth)
+        numbers = state.add(points, np.full(len(points), label, np.intp))
+        detections.take(rows[chosen], numbers[landmark])
+
+
+def predicted_covariances(problem: Elimination, cycles: IntArray, keys: IntArray, jacobian: Array) -> Array:
+    """Compute `J Sigma J'` (m, 2, 2), J (m, 2, 5) by [pose | landmark], for cycles (m,) and keys (m,)."""
+    landmark = problem.map.columns(keys)[:, None] + np.arange(POINT)
+    pose = POSE * cycles[:, None] + np.arange(POSE)
+    cross = problem.cross_covariance[pose[:, :, None], landmark[:, None, :]]
+    own = problem.map_covariance[landmark[:, :, None], landmark[:, None, :]]
+    joint = np.block([[problem.pose_marginals[cycles], cross], [np.swapaxes(cross, 1, 2), own]])
+    return np.asarray(jacobian @ joint @ np.swapaxes(jacobian, 1, 2))
+
+
+def remove_rare(state: LandmarkState, detections: LandmarkDetections, fewest: int) -> None:
+    """Remove landmarks with fewer detections than `fewest`; their detections become unassociated."""
+    counts = np.bincount(state.positions(detections.landmark[detections.used]), minlength=len(state))
+    gone = counts < fewest
+    detections.landmark[np.isin(detections.landmark, state.numbers[gone])] = UNASSOCIATED
+    state.variables.remove(state.keys[gone])
+    state.keep(~gone)
