@@ -1,7 +1,7 @@
 """What a command prints: results on standard output, hints and the progress of long work on the other."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import timedelta
@@ -59,8 +59,11 @@ def say(*lines: str, console: Console | None = None) -> None:
 
 
 @contextmanager
-def progress(description: str, total: int | None = None, lines: int = 0) -> "Iterator[Steps]":
-    """Show a bar on a terminal, or a spinner without a total, and yield what counts the steps.
+def progress(description: str, total: int | None = None, lines: int = 0) -> Iterator[Callable[..., None]]:
+    """Show a bar on a terminal, or a spinner without a total, and yield the function that counts a step.
+
+    With arguments that function sets how many steps of how many are done. It tells the time that remains by
+    the mean of the steps.
 
     A notebook shows the same bar with ipywidgets, and lines without. Elsewhere nothing is shown, unless
     `lines` asks for about that many lines.
@@ -77,31 +80,21 @@ def progress(description: str, total: int | None = None, lines: int = 0) -> "Ite
     shown = columns if total is not None or lines else columns[:2]
     hidden = level == Verbosity.QUIET or not has_bar
     with Progress(*shown, console=console, transient=True, disable=hidden) as display:
-        yield Steps(display, description, total, lines)
+        begin, steps = time.monotonic(), 0
+        task = display.add_task(description, total=total, remaining="")
 
+        def step(done: int | None = None, of: int | None = None) -> None:
+            nonlocal steps, total
+            steps, total = steps + 1 if done is None else done, total if of is None else of
+            remaining = ""
+            if total is not None:
+                remaining = "time left unknown"
+                if steps:
+                    mean = (time.monotonic() - begin) / steps
+                    remaining = f"{timedelta(seconds=round(mean * (total - steps)))} left"
+            display.update(task, completed=steps, total=total, remaining=remaining)
+            is_due = lines and total and (steps % -(-total // lines) == 0 or steps == total)
+            if is_due and not console.is_terminal:
+                console.print(f"{description}: {steps} of {total}, {remaining}", markup=False)
 
-class Steps:
-    """Counter of the steps of long work, which estimates the time that remains by their mean."""
-
-    def __init__(self, display: Progress, description: str, total: int | None, lines: int) -> None:
-        self._display, self._description = display, description
-        self._done, self._total, self._lines = 0, total, lines
-        self._begin = time.monotonic()
-        self._task = display.add_task(description, total=total, remaining="")
-
-    def __call__(self, done: int | None = None, total: int | None = None) -> None:
-        """Count one more step, or set how many steps of how many are done."""
-        self._done = self._done + 1 if done is None else done
-        self._total = self._total if total is None else total
-        remaining = ""
-        if self._total is not None:
-            remaining = "time left unknown"
-            if self._done:  # by the mean of the steps
-                mean = (time.monotonic() - self._begin) / self._done
-                remaining = f"{timedelta(seconds=round(mean * (self._total - self._done)))} left"
-        self._display.update(self._task, completed=self._done, total=self._total, remaining=remaining)
-        if self._lines and self._total and not self._display.console.is_terminal:
-            interval = -(-self._total // self._lines)
-            if self._done % interval == 0 or self._done == self._total:
-                text = f"{self._description}: {self._done} of {self._total}, {remaining}"
-                self._display.console.print(text, markup=False)
+        yield step

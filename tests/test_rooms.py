@@ -20,10 +20,13 @@ LATE = {
     "commands.estimate": {"eval.view.recording", "commands.pictures"},
     "commands.pictures": {"eval.view.page"},
     "options.runs": {"io.parsing"},
-    "brief": {"eval.figures.map_plot", "eval.figures.notebook", "frames"},
+    "brief": {"eval.figures.notebook"},
+    "io.log": {"eval.figures.map_plot"},
+    "io.map": {"eval.figures.map_plot"},
+    "io.results": {"eval.figures.notebook", "frames"},
 }
 """Modules that are imported by name when needed, since matplotlib is slow."""
-ASKED = {"brief"}
+ASKED = {"brief", "io.log", "io.map", "io.results"}
 """Modules that import from above by name where a user asks a record for its picture or its frame."""
 
 LEAVES = {"errors", "labels", "console", "lengths", "copies", "brief"}

@@ -11,24 +11,15 @@ from typing import Final, Self
 import numpy as np
 from scipy.linalg import block_diag, lapack
 
+from pathspace_graph.factors import se2
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import clamped_knots, scatter
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.residuals import greville, project, smoothness_matrix
-from pathspace_graph.factors.se2 import (
-    compose,
-    in_vehicle,
-    path_lengths,
-    rotated,
-    rotation,
-    to_map,
-    to_vehicle,
-)
 from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, corrected
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
-from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES, UNKNOWN
 from pathspace_graph.mapping import path
 from pathspace_graph.mapping.motion import MeasuredMotion
@@ -80,7 +71,6 @@ def transform(function: Callable[[Array], Array], mean: Array, covariance: Array
     return Transformed(centre, spread.T @ spread, np.asarray(slope).T)
 
 
-_ODOMETRY: Final = slice(POSE, POSE + CALIBRATION_SIZE)
 HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE  # number of entries of the state before its points
 SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)  # entries of the sensor's calibration
 
@@ -138,11 +128,6 @@ class Belief:
         """Derivatives (m, 2, 5) of the newest detections (m, 2) by the sensor's calibration."""
         return by_sensor(points_vehicle, np.tile(self.twist, (len(points_vehicle), 1)))
 
-    def vehicle_state(self) -> VehicleState:
-        """Return a copy of the pose and the calibration, with their joint covariance."""
-        covariance = self.covariance[:HEAD, :HEAD].copy()
-        return VehicleState.split(self.pose, self.mean[POSE:HEAD], covariance)
-
     def follow(self, motion: MeasuredMotion) -> None:
         """Predict the pose by a motion, and update by a bias that was measured at rest."""
         self.predict(motion.odometry)
@@ -158,8 +143,8 @@ class Belief:
         augmented[HEAD:, HEAD:] = odometry.covariance
 
         def drive(x: Array) -> Array:
-            error = x[:, HEAD:] - x[:, _ODOMETRY] @ drift.T
-            return compose(compose(x[:, :POSE], odometry.delta), error)
+            error = x[:, HEAD:] - x[:, POSE : POSE + CALIBRATION_SIZE] @ drift.T
+            return se2.compose(se2.compose(x[:, :POSE], odometry.delta), error)
 
         moved = transform(drive, np.append(self.mean[:HEAD], np.zeros(POSE)), augmented)
         cross = moved.slope[:, :HEAD] @ self.covariance[:HEAD, POSE:]
@@ -239,13 +224,13 @@ def point_columns(points: IntArray) -> IntArray:
 def to_map_rows(poses: Array, detections: Array) -> Array:
     """Transform r detections (k, 2 r) from each of k poses (k, 3) to the map frame: `R z + t`."""
     repeated = np.repeat(poses, detections.shape[1] // POINT, axis=0)
-    return to_map(detections.reshape(-1, POINT), repeated).reshape(len(poses), -1)
+    return se2.to_map(detections.reshape(-1, POINT), repeated).reshape(len(poses), -1)
 
 
 def to_vehicle_rows(poses: Array, points: Array) -> Array:
     """Transform r map points (k, 2 r) to the vehicle frame of each of k poses (k, 3): `R' (p - t)`."""
     repeated = np.repeat(poses, points.shape[1] // POINT, axis=0)
-    return to_vehicle(points.reshape(-1, POINT), repeated).reshape(len(poses), -1)
+    return se2.to_vehicle(points.reshape(-1, POINT), repeated).reshape(len(poses), -1)
 
 
 # --- the paper's state: pose and control points of clamped splines, growth and update (paper: Expansion)
@@ -259,8 +244,8 @@ SIGMA_START: Final = 0.3  # added standard deviation of a new curve's control po
 
 def in_map(detections: Detections, pose: Array) -> tuple[Array, Array]:
     """Transform detections from a pose (3,) to the map frame: points (m, 2) and covariances (m, 2, 2)."""
-    turned = rotated(detections.covariances, np.full(len(detections.labels), pose[2]))
-    return to_map(detections.points_vehicle, pose[None]), turned
+    turned = se2.rotated(detections.covariances, np.full(len(detections.labels), pose[2]))
+    return se2.to_map(detections.points_vehicle, pose[None]), turned
 
 
 class CurveState:
@@ -271,10 +256,6 @@ class CurveState:
         self.belief = belief  # mean and covariance of x
         self.curves: dict[int, BSpline] = {}  # by label; knots are current, control points are in the belief
         self.pose_u: dict[int, float] = {}  # parameter of the vehicle's foot point on each curve, not wrapped
-
-    @property
-    def pose(self) -> Array:
-        return self.belief.pose
 
     def offset(self, label: int) -> int:
         """Number of points in x before a curve's first control point."""
@@ -306,13 +287,15 @@ class CurveState:
     def locate_vehicle(self) -> None:
         """Update the vehicle's parameter on each curve: near the last one, or everywhere if it is far off."""
         gate = self.settings.gate
-        heading = np.array([np.cos(self.pose[2]), np.sin(self.pose[2])])
+        heading = np.array([np.cos(self.belief.pose[2]), np.sin(self.belief.pose[2])])
         for label, last in self.pose_u.items():
             low, high = np.array([last - gate.station_behind]), np.array([last + gate.station_ahead])
-            foot = self.foot_points(label, self.pose[None, :2], low, high)
+            foot = self.foot_points(label, self.belief.pose[None, :2], low, high)
             u = float(foot.u[0])
             if foot.tangent_unit[0] @ heading < 0.0 or abs(foot.distance[0]) > gate.station_lateral:
-                u = relocate(self.boundary(label), self.control_points(label), self.pose, gate.station_room)
+                u = relocate(
+                    self.boundary(label), self.control_points(label), self.belief.pose, gate.station_room
+                )
             if self.curves[label].periodic:
                 begin, end = self.curves[label].domain
                 u += (end - begin) * round((last - u) / (end - begin))
@@ -328,7 +311,7 @@ class CurveState:
         belief, p, k = self.belief, self.settings.spline.degree, len(detections)
         count = len(belief.points)
         belief.add_points(detections, covariances)
-        along = path_lengths(detections)
+        along = se2.path_lengths(detections)
         at = np.linspace(0.0, along[-1], p + 1)
         matrix = np.column_stack([np.interp(at, along, row) for row in np.eye(k)])
         belief.transform_points(count, count + k, matrix, np.full(p + 1, SIGMA_START))
@@ -375,7 +358,6 @@ class CurveState:
 
 
 LONGEST_EXTENSION: Final = 12.0  # largest length of one extension (m)
-SIGMA_CARRY: Final = 1.0  # standard deviation of the control point of an extrapolated end (m)
 
 
 class Expansion:
@@ -393,7 +375,7 @@ class Expansion:
 
     def observe(self, state: CurveState, detections: Detections) -> None:
         """Add all detections of a cycle to the tracks, and newly confirmed ones to the observed cones."""
-        points, covariances = in_map(detections, state.pose)
+        points, covariances = in_map(detections, state.belief.pose)
         tracks = self.tentative
         tracks.add(points, covariances, detections.labels, detections.t)
         for label, known in self.observed.items():
@@ -405,13 +387,15 @@ class Expansion:
     ) -> set[int]:
         """Begin or extend each curve by `free` detections (m,), which update none; return grown curves."""
         extended: set[int] = set()
+        model = self.settings.ckf.sigma_model**2 * np.eye(2)
+        detections = replace(detections, covariances=detections.covariances + model)
         for label in BOUNDARIES:
             rows = np.flatnonzero(free & (detections.labels == label))
             found = self._candidates(state, label, detections, rows, path_ahead)
             if label not in state.curves:
                 rows = found.where(found.sides < self.settings.growth.max_lateral).indices
                 if len(rows) > 1:
-                    state.begin(label, detections.points_vehicle[rows], self._covariances(detections, rows))
+                    state.begin(label, detections.points_vehicle[rows], detections.covariances[rows])
             elif self._extend(state, label, detections, found):
                 extended.add(label)
                 self._carried[label] = 0.0
@@ -423,7 +407,7 @@ class Expansion:
         self, state: CurveState, label: int, detections: Detections, rows: IntArray, path_ahead: PathAhead
     ) -> Candidates:
         settings, tentative = self.settings.growth, self.tentative
-        points = to_map(detections.points_vehicle[rows], state.pose[None])
+        points = se2.to_map(detections.points_vehicle[rows], state.belief.pose[None])
         indices = tentative.confirmed(label, settings.sightings)
         confirmed = tentative.points[indices[tentative.undisputed(indices, label)]]
         near = nearest_within(points, confirmed, settings.merge_radius)[1]
@@ -448,18 +432,13 @@ class Expansion:
         last = state.control_points(label)[-1].copy()
         order = proximity_chain(found.points, last)
         points, rows = found.points[order], found.indices[order]
-        covariances = self._covariances(detections, rows)
         for i in range(len(rows)):
             final = i == len(rows) - 1
             too_far = not final and np.hypot(*(points[i + 1] - last)) > LONGEST_EXTENSION
             if final or (too_far and np.hypot(*(points[i] - last)) > GROWTH_THRESHOLD):
-                state.extend(label, detections.points_vehicle[rows[i]], covariances[i])
+                state.extend(label, detections.points_vehicle[rows[i]], detections.covariances[rows[i]])
                 last = points[i]
         return True
-
-    def _covariances(self, detections: Detections, rows: IntArray) -> Array:
-        model = self.settings.ckf.sigma_model**2 * np.eye(2)
-        return np.asarray(detections.covariances[rows] + model)
 
     def _carry_on(self, state: CurveState, label: int, path_ahead: PathAhead) -> bool:
         """Extrapolate a passed end beside the path, nearly up to the vehicle; return whether it grew."""
@@ -473,8 +452,8 @@ class Expansion:
         if not path.MIN_CARRY <= distance <= settings.max_unseen - self._carried[label]:
             return False
         self._carried[label] += distance
-        point_vehicle = (point - state.pose[:2]) @ rotation(state.pose[2])
-        state.extend(label, point_vehicle, SIGMA_CARRY**2 * np.eye(2))
+        point_vehicle = (point - state.belief.pose[:2]) @ se2.rotation(state.belief.pose[2])
+        state.extend(label, point_vehicle, np.eye(2))  # uncertain by 1 m
         return True
 
 
@@ -548,14 +527,14 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
     """
     gate, curve = state.settings.gate, state.curves[label]
     rows = np.flatnonzero((detections.labels == label) | (detections.labels == UNKNOWN))
-    poses = np.tile(state.pose, (len(rows), 1))
-    points = to_map(detections.points_vehicle[rows], poses)
+    poses = np.tile(state.belief.pose, (len(rows), 1))
+    points = se2.to_map(detections.points_vehicle[rows], poses)
     foot = state.foot_points(label, points, *state.visible_range(label, len(rows)))
     projected = project(points, detections.covariances[rows], poses, foot, state.settings.ckf.sigma_model)
     control, width = foot.span[:, None] + np.arange(-curve.degree, 1), POINT * (curve.degree + 1)
     control = control % curve.size if curve.periodic else control
-    expected = to_vehicle(foot.position, poses)
-    normals = in_vehicle(foot.normal_unit, poses)
+    expected = se2.to_vehicle(foot.position, poses)
+    normals = se2.in_vehicle(foot.normal_unit, poses)
     by_calibration = np.einsum("mi,mik->mk", normals, state.belief.by_sensor(expected))
     by_control = projected.by_control.reshape(len(rows), width)
     gradient = np.concatenate([projected.by_pose, by_calibration, by_control], axis=1)
@@ -613,50 +592,42 @@ def fit_detections(basis: Array, detections: Array, covariances: Array, known: A
     return SplineMeasurement(fitted.mean.reshape(r, 2), fitted.covariance, gain, gain @ basis, known)
 
 
-@dataclass(frozen=True, eq=False)
-class CurveBlock:
-    """Block of the measurement for one curve."""
-
-    columns: IntArray  # (2 r,) entries of the state that are the measured control points
-    fitted: SplineMeasurement  # S_z in the vehicle frame
-    combinations: Array  # (2 r, q) linear combinations of the coordinates of S_z that are measured
-    by_sensor: Array  # (2 r, 5) derivative of S_z by the calibration of the sensor
-
-
 def update(state: CurveState, detections: Detections, found: dict[int, OnCurve]) -> None:
-    """Fit S_z of each curve, and update pose and map by all of them at once."""
-    blocks = [_fit(state, label, detections, on) for label, on in found.items() if len(on.rows)]
-    if not blocks:
+    """Fit S_z of each curve, and update pose and map by all of them at once.
+
+    A fit is on the control points that the detections reach. Their covariances are
+    `K + sigma_model^2 I + sigma_along^2 t t'`, vehicle frame, with unit tangents t.
+    """
+    belief, model = state.belief, state.settings.ckf.sigma_model**2 * np.eye(POINT)
+    own_columns, fits = list[IntArray](), list[SplineMeasurement]()
+    combinations, by_calibration = list[Array](), list[Array]()  # each (2 r, q) and (2 r, 5)
+    for label, on in found.items():
+        if not len(on.rows):
+            continue
+        control = np.flatnonzero(on.basis.sum(axis=0) > 1e-3)
+        known = to_vehicle_rows(state.belief.pose[None], state.control_points(label)[control].reshape(1, -1))
+        t = on.tangents @ se2.rotation(state.belief.pose[2])
+        along = SIGMA_ALONG**2 * t[:, :, None] * t[:, None, :]
+        covariances = detections.covariances[on.rows] + model + along
+        points, basis = detections.points_vehicle[on.rows], on.basis[:, control]
+        fitted = fit_detections(basis, points, covariances, known.reshape(-1, POINT))
+        expected = belief.by_sensor(basis @ fitted.known)
+        own_columns.append(state.columns(label, control))
+        fits.append(fitted)
+        combinations.append(np.asarray(np.kron(fitted.range_basis(), np.eye(POINT)), float))
+        by_calibration.append(np.einsum("rm,mik->rik", fitted.gain, expected).reshape(-1, SENSOR_SIZE))
+    if not fits:
         return
-    ends = np.cumsum([len(block.columns) for block in blocks])
-    head, now = POSE + SENSOR_SIZE, state.belief.sensor.copy()
+    ends, head, now = np.cumsum([*map(len, own_columns)]), POSE + SENSOR_SIZE, belief.sensor.copy()
 
     def predict(x: Array) -> Array:
-        control_vehicle, predicted = to_vehicle_rows(x[:, :POSE], x[:, head:]), []
-        for block, own in zip(blocks, np.split(control_vehicle, ends[:-1], axis=1), strict=True):
-            fitted = block.fitted.refitted(own.reshape(len(x), -1, POINT)).reshape(len(x), -1)
-            predicted.append((fitted - (x[:, POSE:head] - now) @ block.by_sensor.T) @ block.combinations)
+        parts, predicted = np.split(to_vehicle_rows(x[:, :POSE], x[:, head:]), ends[:-1], axis=1), []
+        for own, fitted, combine, slope in zip(parts, fits, combinations, by_calibration, strict=True):
+            seen = fitted.refitted(own.reshape(len(x), -1, POINT)).reshape(len(x), -1)
+            predicted.append((seen - (x[:, POSE:head] - now) @ slope.T) @ combine)
         return np.concatenate(predicted, axis=1)
 
-    columns = state.belief.measuring_columns(np.concatenate([block.columns for block in blocks]))
-    measured = np.concatenate([block.fitted.points.ravel() @ block.combinations for block in blocks])
-    noise = block_diag(*(b.combinations.T @ b.fitted.covariance @ b.combinations for b in blocks))
-    state.belief.update(columns, predict, measured, noise)
-
-
-def _fit(state: CurveState, label: int, detections: Detections, on: OnCurve) -> CurveBlock:
-    """Fit S_z of one curve, on the control points that the detections reach.
-
-    Their covariances are `K + sigma_model^2 I + sigma_along^2 t t'`, vehicle frame, with unit tangents t.
-    """
-    control = np.flatnonzero(on.basis.sum(axis=0) > 1e-3)
-    known = to_vehicle_rows(state.pose[None], state.control_points(label)[control].reshape(1, -1))
-    points = detections.points_vehicle[on.rows]
-    t = on.tangents @ rotation(state.pose[2])
-    along = SIGMA_ALONG**2 * t[:, :, None] * t[:, None, :]
-    covariances = detections.covariances[on.rows] + state.settings.ckf.sigma_model**2 * np.eye(POINT) + along
-    fitted = fit_detections(on.basis[:, control], points, covariances, known.reshape(-1, POINT))
-    combinations: Array = np.asarray(np.kron(fitted.range_basis(), np.eye(POINT)), float)
-    expected = state.belief.by_sensor(on.basis[:, control] @ fitted.known)
-    by_calibration = np.einsum("rm,mik->rik", fitted.gain, expected).reshape(-1, SENSOR_SIZE)
-    return CurveBlock(state.columns(label, control), fitted, combinations, by_calibration)
+    pairs = list(zip(fits, combinations, strict=True))
+    measured = np.concatenate([fitted.points.ravel() @ combine for fitted, combine in pairs])
+    noise = block_diag(*(combine.T @ fitted.covariance @ combine for fitted, combine in pairs))
+    belief.update(belief.measuring_columns(np.concatenate(own_columns)), predict, measured, noise)

@@ -21,14 +21,7 @@ from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.factors.sensor import by_sensor, restored
 from pathspace_graph.front_end.front_end import FrontEnd, Reading, is_orange, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
-from pathspace_graph.graph.elimination import (
-    Damping,
-    Elimination,
-    linear_graph,
-    marginal_before,
-    owners,
-    solution,
-)
+from pathspace_graph.graph import elimination
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.smoother import FixedLagSmoother, merge_points
 from pathspace_graph.graph.variables import (
@@ -279,16 +272,16 @@ class LandmarkSystem:
         """All rows, those of the detections last, weighted by a Huber threshold (sigmas)."""
         rows = landmark_rows(state, self.detections, np.flatnonzero(self.detections.used), huber)
         labels = state.labels[state.positions(indices(rows.keys[:, -1]))]
-        seen = replace(rows, owner=owners(rows.owner, labels == RIGHT))
+        seen = replace(rows, owner=elimination.owners(rows.owner, labels == RIGHT))
         return [*self.chain.rows_at(state.variables, self.settings.calibration), seen]
 
-    def eliminated(self, state: LandmarkState) -> Elimination:
-        graph = linear_graph(self.rows(state, self.settings.gate.huber), state.variables)
-        return Elimination(graph, state.variables.layout)
+    def eliminated(self, state: LandmarkState) -> elimination.Elimination:
+        graph = elimination.linear_graph(self.rows(state, self.settings.gate.huber), state.variables)
+        return elimination.Elimination(graph, state.variables.layout)
 
     def optimize(self, state: LandmarkState) -> None:
         """Optimize a state by Levenberg-Marquardt with fixed associations; landmarks are damped (1/m^2)."""
-        variables, cost, damping = state.variables, self.cost(state), Damping()
+        variables, cost, damping = state.variables, self.cost(state), elimination.Damping()
         keys = np.repeat(state.keys, POINT)[:, None]
         still = Rows(
             keys,
@@ -299,7 +292,8 @@ class LandmarkSystem:
         for _ in range(80):
             damped = replace(still, jacobian=np.sqrt(damping.weight) * still.jacobian)
             rows, before = self.rows(state, self.settings.gate.huber), variables.values
-            variables.values = before + solution(linear_graph([*rows, damped], variables), variables.layout)
+            graph = elimination.linear_graph([*rows, damped], variables)
+            variables.values = before + elimination.solution(graph, variables.layout)
             gain = cost - self.cost(state)
             if gain < 0.0:
                 variables.values = before
@@ -317,7 +311,7 @@ class LandmarkSystem:
         It is given by keys, mean (n,) and information (n, n).
         """
         rows = self.rows(state, self.settings.gate.huber)
-        layout, information, vector = marginal_before(rows, state.variables, first)
+        layout, information, vector = elimination.marginal_before(rows, state.variables, first)
         here = state.variables.values[state.variables.layout.entries(layout.keys)]
         return layout.keys, here + np.linalg.solve(information, vector), information
 

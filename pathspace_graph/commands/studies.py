@@ -1,6 +1,6 @@
 """`ablate`, `faults`, `scale`, `report`, `compare`, `demo`: estimators side by side, on one or many logs."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -16,17 +16,9 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT_ONLINE, ONLINE, check_online, make_online
 from pathspace_graph.eval import benchmark
 from pathspace_graph.eval.experiment import compare as experiment
+from pathspace_graph.eval.experiment import run as runs
 from pathspace_graph.eval.experiment.compare import compare, side_by_side
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
-from pathspace_graph.eval.experiment.run import (
-    check_jobs,
-    make_plan,
-    of_other_code,
-    run_estimator,
-    run_study,
-    unfinished,
-    workers,
-)
 from pathspace_graph.eval.experiment.study import Study, find_study, log_folders, read_study_file
 from pathspace_graph.eval.experiment.tables import write_study
 from pathspace_graph.eval.figures.map_plot import plot_apart, plot_map
@@ -50,7 +42,7 @@ def execute(
     options: StudyCommand, study: Study, write: Callable[[Study, pd.DataFrame, Path], str]
 ) -> Outcome:
     """Run a study with the drives of the options, `write` it and print the text of it."""
-    check_jobs(options.jobs)
+    runs.check_jobs(options.jobs)
     if options.laps is not None and options.laps < 1:
         raise SettingsError(f"--laps: expected at least 1, found {options.laps}")
     tracks = tuple(int(track) if track.isdecimal() else Path(track) for track in options.tracks)
@@ -59,12 +51,12 @@ def execute(
         study = replace(study, tracks=tracks, logs=logs)
     chosen: dict[str, Any] = {"seeds": options.seeds, "laps": options.laps}
     study = replace(study, **{name: value for name, value in chosen.items() if value})
-    plan = make_plan(study, keep=options.keep)
-    if stale := of_other_code(options.out, plan.cells):
+    plan = runs.make_plan(study, keep=options.keep)
+    if stale := runs.of_other_code(options.out, plan.cells):
         note(f"{stale} runs in {options.out} are of other code, and are not used")
     with progress("runs", lines=LINES) as advance:
         how: dict[str, Any] = {"cluster": options.cluster, "retry_failed": options.retry_failed}
-        frame = run_study(plan, options.out, jobs=options.jobs, on_cell=advance, **how)
+        frame = runs.run_study(plan, options.out, jobs=options.jobs, on_cell=advance, **how)
     text = write(study, frame, options.out)
     say(text.rstrip("\n"), "")
     failures = frame[frame["failure"] != ""]["failure"].tolist()
@@ -92,7 +84,7 @@ def scale_command(options: Scale) -> Outcome:
         raise SettingsError("--quick: expected no other --scaling options with it, found some")
     check_target(options.out, benchmark.MARKER, force=options.force)
     measured = benchmark.QUICK if options.quick else options.scaling
-    with unfinished(options.out) as folder:
+    with runs.unfinished(options.out) as folder:
         with progress("sweeps", lines=LINES) as advance:
             points = benchmark.measure_scaling(names, measured, options.settings, folder, on_cell=advance)
         benchmark.write_scaling(options.out, points, measured, options.settings, force=options.force)
@@ -102,7 +94,7 @@ def scale_command(options: Scale) -> Outcome:
 
 
 def report_command(options: Report) -> Outcome:
-    check_jobs(options.jobs)
+    runs.check_jobs(options.jobs)
     drives: dict[str, Any] = {"tracks": options.tracks, "real": options.real, "quick": options.quick}
     with progress("runs", lines=LINES) as advance:
         plan = ReportPlan(jobs=options.jobs, on_cell=advance, **drives)
@@ -126,11 +118,11 @@ def compare_command(options: Compare) -> Outcome:
         raise SettingsError(f"LOG: expected one log, or two maps, found {len(options.log)} folders")
     own = options.own(options.estimators)
     plan = experiment.plan_of(options.log[0], options.estimators, options.settings, own)
-    check_jobs(options.jobs)
+    runs.check_jobs(options.jobs)
     check_target(options.out, experiment.MARKER, force=options.force)
     for drive in dict.fromkeys(cell.drive for cell in plan.cells):
         tell(drive.load()[1], of=drive.source if len(plan.study.logs) > 1 else "")
-    with unfinished(options.out) as folder:
+    with runs.unfinished(options.out) as folder:
         with progress("comparing", lines=LINES) as advance:
             comparison = compare(plan, folder, jobs=options.jobs, on_cell=advance)
         with progress("writing"):
@@ -140,13 +132,10 @@ def compare_command(options: Compare) -> Outcome:
     for table in printed.values():
         console.print(table.title, highlight=False, markup=False)
         console.print(table.rich())
-    note(*(f"{_name(run)}: not converged" for run in comparison.unsettled))
-    wrong = [f"{_name(run)}: failed, {run['error']}" for run in comparison.failures]
+    named = "{estimator} on {log}".format_map
+    note(*(f"{named(run)}: not converged" for run in comparison.unsettled))
+    wrong = [f"{named(run)}: failed, {run['error']}" for run in comparison.failures]
     return Outcome([options.out], {name: table.records() for name, table in printed.items()}, wrong)
-
-
-def _name(names: Mapping[str, str]) -> str:
-    return f"{names['estimator']} on {names['log']}"
 
 
 def compare_maps(first: Path, second: Path, out: Path, *, force: bool) -> Outcome:
@@ -177,8 +166,8 @@ def demo_command(options: Demo) -> Outcome:
     with progress("driving"):
         log = simulate(generated_track(options.seed), SimulationSettings(laps=options.laps), options.seed)
     say(f"a generated track, {options.laps} times around: {describe(log)}")
-    with workers(2):  # the rival in another process; with one job it would be run here, and first
-        begun = Parallel(return_as="generator")([delayed(run_estimator)(RIVAL, options.settings, log)])
+    with runs.workers(2):  # the rival in another process; with one job it would be run here, and first
+        begun = Parallel(return_as="generator")([delayed(runs.run_estimator)(RIVAL, options.settings, log)])
         result = map_online(log, make_online(DEFAULT_ONLINE, options.settings, log))
         with progress(RIVAL):
             (rival,) = begun  # to the end, or joblib warns of tasks that were cancelled

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
+from importlib import import_module
 from importlib.metadata import version
 from math import nan
 from pathlib import Path
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_info
 
-from pathspace_graph.brief import Brief, Shown, frames, notebook
+from pathspace_graph.brief import Brief, Shown
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION, CALIBRATION_SIZE
@@ -214,12 +215,13 @@ class RunResult(Shown):
 
     def to_frame(self) -> pd.DataFrame:
         """Convert the run to a frame: a row for each cycle, as in `cycles.csv`, with its pose x, y, theta."""
-        frame: pd.DataFrame = frames().run_frame(self)
+        frame: pd.DataFrame = import_module("pathspace_graph.frames").run_frame(self)
         return frame
 
     def metrics(self, truth: Truth) -> pd.DataFrame:
         """Measure each complete lap against the truth of its log: the columns of `ablate`, by lap."""
-        frame: pd.DataFrame = notebook().metrics(self, truth)
+        metrics = import_module("pathspace_graph.eval.figures.notebook").metrics
+        frame: pd.DataFrame = metrics(self, truth)
         return frame
 
     def plot(self, **options: Any) -> Figure:

@@ -1,22 +1,12 @@
 """Settings whose values msgspec checks where they are made, and overrides by dotted fields."""
 
+import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass, replace
 from functools import cache
 from sys import float_info
 from types import NoneType, UnionType
-from typing import (
-    Annotated,
-    Any,
-    ClassVar,
-    Final,
-    Literal,
-    TypeVar,
-    Union,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -79,21 +69,21 @@ def as_setting(value: Any, settings: type[Any], name: str, where: str) -> Any:
 def _types(settings: type[Any]) -> dict[str, Any]:
     """Type of each setting, with the default limits of the numbers where it is `Checked`."""
     limits = {float: Positive, int: Count} if issubclass(settings, Checked) else {}
-    types, hints = {}, get_type_hints(settings, include_extras=True)
+    types, hints = {}, typing.get_type_hints(settings, include_extras=True)
     for entry in fields(settings):
         hint = hints[entry.name]
-        parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-        types[entry.name] = Union[tuple(limits.get(part, part) for part in parts)]  # noqa: UP007
+        parts = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, UnionType) else (hint,)
+        types[entry.name] = typing.Union[tuple(limits.get(part, part) for part in parts)]  # noqa: UP007
     return types
 
 
 def _in_words(kind: Any) -> str:
-    parts = get_args(kind)
-    if get_origin(kind) is Literal:
+    parts = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
         return " or ".join(map(repr, parts))
-    if get_origin(kind) is tuple:
+    if typing.get_origin(kind) is tuple:
         return f"a list of {'' if parts[-1] is ... else f'{len(parts)} '}values, each {_in_words(parts[0])}"
-    if get_origin(kind) is Annotated:
+    if typing.get_origin(kind) is Annotated:
         described = (part.description for part in parts if isinstance(part, Meta))
         return next(described, None) or _in_words(parts[0])
     words = " or ".join(_in_words(part) for part in parts if part is not NoneType)

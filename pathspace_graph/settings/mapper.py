@@ -173,7 +173,6 @@ class SidesSettings(Checked):
 
 WIDE_ODOMETRY: Final = 10.0  # standard deviations of the odometry's wide priors by those of a calibrated one
 HELD: Final = 0.02  # standard deviation of a fixed scale, by its own
-WIDE_SENSOR: Final = 20.0  # standard deviations of the sensor's wide priors by those of a calibrated one
 
 
 class _Priors(Checked):
@@ -273,10 +272,11 @@ class CalibrationSettings(_Priors):
     def widened(self) -> Self:
         """Widen the priors, which are not doubted again.
 
-        The scale of the ranges keeps its own, or the size of the map would rest on the wheels alone.
+        Their standard deviations are 20 times those of a calibrated sensor. The scale of the ranges keeps its
+        own, or the size of the map would rest on the wheels alone.
         """
         names = (f"sigma_{name}" for name in self.ERRORS if name != "range_scale")
-        return replace(self, doubt=inf, **{name: WIDE_SENSOR * getattr(self, name) for name in names})
+        return replace(self, doubt=inf, **{name: 20.0 * getattr(self, name) for name in names})
 
 
 # --- the batch, and the estimators to compare with ---------------------------------------------------------

@@ -10,14 +10,8 @@ from scipy.sparse import csc_array, csr_array, issparse, vstack
 from scipy.sparse.linalg import SuperLU, splu
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors import bspline
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.bspline import (
-    SpanPolynomials,
-    clamped_knots,
-    periodic_knots,
-    scatter,
-    uniform_knots,
-)
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 from pathspace_graph.factors.se2 import left_of, path_lengths
 
@@ -93,12 +87,14 @@ class BSpline:
         cls, control_points: Array, degree: int = 3, interval: float = 1.0, start: float = 0.0
     ) -> Self:
         """Build a curve on equally spaced knots with floating (unclamped) ends, from `start` on."""
-        return cls(uniform_knots(len(control_points), degree, interval, start), control_points, degree)
+        return cls(
+            bspline.uniform_knots(len(control_points), degree, interval, start), control_points, degree
+        )
 
     @classmethod
     def clamped_from(cls, breaks: Array, control_points: Array, degree: int = 3) -> "BSpline":
         """Build a clamped curve on breaks (k + 1,) with k + p control points."""
-        return cls(clamped_knots(breaks, degree), control_points, degree)
+        return cls(bspline.clamped_knots(breaks, degree), control_points, degree)
 
     @classmethod
     def periodic_from(cls, breaks: Array, control_points: Array, degree: int = 3) -> Self:
@@ -109,7 +105,7 @@ class BSpline:
                 f"not {len(control_points)} points and {len(breaks)} breaks"
             )
         unwrapped = np.concatenate([control_points, control_points[:degree]])
-        return cls(periodic_knots(breaks, degree), unwrapped, degree, periodic=True)
+        return cls(bspline.periodic_knots(breaks, degree), unwrapped, degree, periodic=True)
 
     @classmethod
     def hermite(cls, u: Array, points: Array, slopes: Array) -> Self:
@@ -124,10 +120,10 @@ class BSpline:
         cubic = np.array([[1.0, 0, 0, 0], [-3.0, 3.0, 0, 0], [3.0, -6.0, 3.0, 0], [-1.0, 3.0, -3.0, 1.0]])
         basis = np.broadcast_to(cubic[:, None], (4, 3 * count - 2, 4))  # by power, span and function
         control_points = np.concatenate([pieces.reshape(-1, cls.DIMENSION), points[-1:]])
-        return cls.on(SpanPolynomials(knots, 3, False, basis), control_points)
+        return cls.on(bspline.SpanPolynomials(knots, 3, False, basis), control_points)
 
     @classmethod
-    def on(cls, tables: SpanPolynomials, control_points: Array) -> Self:
+    def on(cls, tables: bspline.SpanPolynomials, control_points: Array) -> Self:
         """Build a curve that shares a basis; control points (n, 2) are unwrapped."""
         spline = cls(tables.knots, control_points, tables.degree, tables.periodic)
         spline.__dict__["tables"] = tables
@@ -163,9 +159,9 @@ class BSpline:
         return np.unique(self.knots[self.degree : len(self.control_points) + 1])
 
     @cached_property
-    def tables(self) -> SpanPolynomials:
+    def tables(self) -> bspline.SpanPolynomials:
         """Basis as polynomials on each span."""
-        return SpanPolynomials(self.knots, self.degree, self.periodic)
+        return bspline.SpanPolynomials(self.knots, self.degree, self.periodic)
 
     def with_points(self, distinct: Array) -> Self:
         """Return the curve of the same basis with other distinct control points (m, 2)."""
@@ -185,7 +181,7 @@ class BSpline:
     def basis_matrix(self, u: Array, derivative: int = 0) -> Array:
         """Matrix B (k, m) of the basis on the distinct control points c: `S(u) = B c`."""
         values, span = self.tables.evaluate(u, derivative)
-        return scatter(values[derivative], span - self.degree, self.size, self.periodic)
+        return bspline.scatter(values[derivative], span - self.degree, self.size, self.periodic)
 
     def evaluate(self, u: Array, derivative: int = 0) -> Array:
         """Evaluate d^r S / du^r (k, 2) at u (k,); u is clipped to the domain, or wrapped if periodic."""

@@ -75,14 +75,6 @@ def test_the_prior_of_little_bending_bounds_extensions_without_detections_betwee
     assert largest(UNBENT) > 100.0
 
 
-def test_an_extension_of_one_curve_leaves_the_other_as_it_was() -> None:
-    state = straight_rows()
-    right = state.spline(RIGHT)
-    state.extend(LEFT, np.array([18.0, 2.0]), COVARIANCE)
-    np.testing.assert_allclose(state.spline(RIGHT).control_points, right.control_points, atol=1e-6)
-    assert (state.spline(LEFT).control_points[:, 1] > 1.0).all()
-
-
 def test_a_replaced_curve_has_the_transformed_points_and_covariance() -> None:
     state, rng = straight_rows(), np.random.default_rng(5)
     matrix = rng.normal(size=(5, 4))

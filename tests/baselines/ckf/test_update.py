@@ -98,8 +98,8 @@ def test_both_curves_update_the_pose_together() -> None:
     detections = detections_of(points, np.array([LEFT, LEFT, RIGHT, RIGHT]))
     state.belief.covariance[1, 1] += 1.0
     update(state, detections, classify(state, detections))
-    assert -0.2 < state.pose[1] < -0.1
-    seen = to_vehicle_rows(state.pose[None], state.control_points(RIGHT).reshape(1, -1))[0, 1::2]
+    assert -0.2 < state.belief.pose[1] < -0.1
+    seen = to_vehicle_rows(state.belief.pose[None], state.control_points(RIGHT).reshape(1, -1))[0, 1::2]
     assert np.abs(seen + 1.8).max() < 0.1
 
 
