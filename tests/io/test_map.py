@@ -109,15 +109,6 @@ def test_scipy_evaluates_the_written_map_the_same() -> None:
         )
 
 
-def test_a_periodic_boundary_repeats_its_first_control_points_and_counts_them_once() -> None:
-    content = map_to_json(spline_map())["boundaries"]["left"]
-    assert content["periodic"] is True
-    assert len(content["control_points"]) == 9 + 3
-    assert content["control_points"][-3:] == content["control_points"][:3]
-    assert content["size"] == 9
-    assert np.shape(content["covariance"]) == (18, 18)
-
-
 @pytest.mark.parametrize("named", ["", MAP_FILE])
 def test_what_is_written_is_read_back_exactly(tmp_path: Path, named: str) -> None:
     original = spline_map()

@@ -75,10 +75,6 @@ def test_knots_go_where_the_curve_bends() -> None:
     assert 20.0 / along(points)[-1] < 0.2
 
 
-def distances(spline: BSpline, points: Array) -> Array:
-    return closest_points(spline, points).distance
-
-
 def test_a_smaller_curve_is_taken_where_it_foretells_better() -> None:
     """A circle is a curve of few control points; more of them only follow the noise."""
     chosen = chosen_breaks(circle(80, 0.2), True, DEGREE, 8, 40)
