@@ -5,23 +5,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import timedelta
-from enum import IntEnum
 from importlib.util import find_spec
-from typing import Final
+from typing import Final, Literal
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
-
-class Verbosity(IntEnum):
-    """How much is printed; hints and errors always are."""
-
-    QUIET = -1  # no results and no progress
-    NORMAL = 0
-    VERBOSE = 1  # progress in lines where there is no terminal, and the traceback of an error
-
-
-VERBOSITY: Final = ContextVar("verbosity", default=Verbosity.NORMAL)
+# How much is printed; hints and errors always are. QUIET is no results and no progress, VERBOSE is progress
+# in lines where there is no terminal, and the traceback of an error.
+VERBOSITY: Final = ContextVar("verbosity", default="NORMAL")
 FILE_WIDTH: Final = 160  # width of tables where the output is no terminal (characters)
 LINES: Final = 20  # about the number of lines of progress, where they are printed
 
@@ -33,8 +25,8 @@ class _Output(Console):
 
 
 @contextmanager
-def verbosity(level: str) -> Iterator[None]:
-    before = VERBOSITY.set(Verbosity[level])
+def verbosity(level: Literal["QUIET", "NORMAL", "VERBOSE"]) -> Iterator[None]:
+    before = VERBOSITY.set(level)
     try:
         yield
     finally:
@@ -43,7 +35,7 @@ def verbosity(level: str) -> Iterator[None]:
 
 def output(wide: bool = False) -> Console:
     """Console for results; tables are `FILE_WIDTH` wide in a file if `wide`."""
-    quiet = VERBOSITY.get() == Verbosity.QUIET
+    quiet = VERBOSITY.get() == "QUIET"
     console = _Output(quiet=quiet)
     return _Output(quiet=quiet, width=FILE_WIDTH) if wide and not console.is_terminal else console
 
@@ -69,16 +61,16 @@ def progress(description: str, total: int | None = None, lines: int = 0) -> Iter
     `lines` asks for about that many lines.
     """
     level, console = VERBOSITY.get(), Console(stderr=True, highlight=False)
-    lines = {Verbosity.QUIET: 0, Verbosity.VERBOSE: LINES}.get(level, lines)
+    lines = {"QUIET": 0, "VERBOSE": LINES}.get(level, lines)
     has_bar = console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
-    if console.is_jupyter and not has_bar and level != Verbosity.QUIET:
+    if console.is_jupyter and not has_bar and level != "QUIET":
         lines = lines or LINES
     text, remaining = (
         TextColumn(f"{{task.{name}}}", markup=False) for name in ("description", "fields[remaining]")
     )
     columns = (SpinnerColumn(), text, BarColumn(), MofNCompleteColumn(), remaining)
     shown = columns if total is not None or lines else columns[:2]
-    hidden = level == Verbosity.QUIET or not has_bar
+    hidden = level == "QUIET" or not has_bar
     with Progress(*shown, console=console, transient=True, disable=hidden) as display:
         begin, steps = time.monotonic(), 0
         task = display.add_task(description, total=total, remaining="")

@@ -24,7 +24,6 @@ from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.alignment import MapDifference, differences
-from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.graph.exchange import GRAPH_FILE, write_graph
@@ -127,7 +126,7 @@ def online_command(options: Online) -> Outcome:
         observers = [] if recorder is None else [recorder]
         mapped = map_online(log, estimator, options.estimator, observers)
         result = of_kind(with_own(mapped, parameters), options.map, options.settings)
-        summarized, changes = summarize(result, log, hints), list[MapDifference]()
+        summarized, changes = summary.summarize(result, log, hints), list[MapDifference]()
         found_at = estimator.placed_at if isinstance(estimator, FixedLagMapper) else None
         if known is not None and found_at is not None:
             before = scaled(known[0], 1.0 / result.scale)
@@ -206,7 +205,7 @@ def batch_of_several(options: Batch) -> Outcome:
     drives = dict[str, Any]()
     shown = ("lap_count", "noise", "calibration", "final", "ate", "inside_two_sigma")
     for own, drive in joint.drives.items():  # with truth in the frame of each drive
-        known = summarize(drive.moved(inverse(joint.frames[own])), logs[own])
+        known = summary.summarize(drive.moved(inverse(joint.frames[own])), logs[own])
         drives[own] = {"frame": joint.frames[own], **{key: known[key] for key in shown if key in known}}
     summarized = summarize_batch(result, logs[name], hints[name])
     summarized |= {"drives": drives, "left_out": joint.left_out}
@@ -267,11 +266,11 @@ def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
 def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
     """Summary of a run, and how its optimization began and ended."""
     start = "odometry" if isinstance(result, BatchResult) and result.online is None else "online"
-    summary = summarize(result, log, hints) | {"start": start, "converged": result.converged}
+    found = summary.summarize(result, log, hints) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
-        return summary
-    summary |= {"convergence": asdict(result.convergence), "objection": result.objection}
-    return summary | {"stages": result.seconds}
+        return found
+    found |= {"convergence": asdict(result.convergence), "objection": result.objection}
+    return found | {"stages": result.seconds}
 
 
 def tell(hints: Sequence[Hint], of: str = "") -> None:
@@ -280,7 +279,10 @@ def tell(hints: Sequence[Hint], of: str = "") -> None:
 
 
 def map_online(
-    log: Log, estimator: OnlineEstimator, name: str = DEFAULT_ONLINE, observers: Sequence[Observer] = ()
+    log: Log,
+    estimator: OnlineEstimator,
+    name: str = DEFAULT_ONLINE,
+    observers: Sequence[Observer] = (),
 ) -> RunResult:
     """Map a log with progress; the map at the end of each true lap is kept where there is truth."""
     times = summary.lap_times(log)
@@ -291,7 +293,7 @@ def map_online(
 
 def report(result: RunResult, log: Log) -> None:
     """Print the run, the paper's table where there is truth, and on standard error what was not mapped."""
-    if laps := laps_of(result, log):
+    if laps := summary.laps_of(result, log):
         table = Table()
         for name in ("lap", "rmse [m]", "missed [%]", "size"):
             table.add_column(Text(name), justify="right")  # a plain text would be markup, [m] a style
@@ -311,7 +313,7 @@ def report(result: RunResult, log: Log) -> None:
     at_one = result.at_scale_one()
     say(*noise_lines(at_one.noise))
     say(*([] if at_one.vehicle is None else diagnose(at_one.vehicle, result.settings)))
-    if missing := not_mapped(result.map, log):
+    if missing := summary.not_mapped(result.map, log):
         note("; ".join(missing))
 
 

@@ -17,7 +17,6 @@ from pathspace_graph.estimators import DEFAULT_ONLINE, ONLINE, check_online, mak
 from pathspace_graph.eval import benchmark
 from pathspace_graph.eval.experiment import compare as experiment
 from pathspace_graph.eval.experiment import run as runs
-from pathspace_graph.eval.experiment.compare import compare, side_by_side
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
 from pathspace_graph.eval.experiment.study import Study, find_study, log_folders, read_study_file
 from pathspace_graph.eval.experiment.tables import write_study
@@ -124,7 +123,7 @@ def compare_command(options: Compare) -> Outcome:
         tell(drive.load()[1], of=drive.source if len(plan.study.logs) > 1 else "")
     with runs.unfinished(options.out) as folder:
         with progress("comparing", lines=LINES) as advance:
-            comparison = compare(plan, folder, jobs=options.jobs, on_cell=advance)
+            comparison = experiment.compare(plan, folder, jobs=options.jobs, on_cell=advance)
         with progress("writing"):
             experiment.write_comparison(options.out, comparison, options.jobs, force=options.force)
     console = output(wide=True)
@@ -176,7 +175,7 @@ def demo_command(options: Demo) -> Outcome:
         write_result(folder / "map", result, summarize(result, log))
         picture = plot_map(result.map, log=log, trajectory=result.trajectory, smoothed=result.smoothed)
         save_plot(picture, folder / PICTURE, 150.0)  # dots per inch, which suits a web page
-    table = side_by_side({run.estimator: laps_of(run, log) for run in (result, rival)})
+    table = experiment.side_by_side({run.estimator: laps_of(run, log) for run in (result, rival)})
     if len(table.frame):
         output().print(table.rich())
     say(outline(result))
