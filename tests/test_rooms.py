@@ -198,9 +198,8 @@ ASSIGNED = {
     | {f"state.{part}" for part in ("votes", "next_number")},
     "mapping.road": {"self.smoother.attached"},
     "mapping.smoother": {"self.window.exact"},
-    "ros.node": {f"marker.{part}" for part in ("ns", "id", "type", "points", "scale.x", "pose.orientation.w")}
+    "ros.node": {f"marker.{part}" for part in ("scale.x", "pose.orientation.w", "color.a")}
     | {
-        "colour.a",
         "position.x",
         "position.y",
         "orientation.z",

@@ -6,7 +6,7 @@ the pose and the control points of clamped splines (paper: Expansion).
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from scipy.linalg import block_diag, lapack
@@ -25,7 +25,7 @@ from pathspace_graph.mapping import path
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.path import END_BEHIND, SIDES, Candidates, End, PathAhead, chain
 from pathspace_graph.mapping.tracks import FORGET_AFTER, Tracks, nearest_within
-from pathspace_graph.settings.mapper import CalibrationSettings, MapperSettings, OdometrySettings
+from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
@@ -90,18 +90,6 @@ class Belief:
         self.mean: Array = np.concatenate([pose, np.zeros(HEAD - POSE)])  # (n,) mean of x
         self.covariance: Array = block_diag(covariance, np.diag(sigma**2))  # (n, n) covariance of x
         self.twist: Array = np.zeros(POSE)  # (3,) twist of the vehicle, in m/s, m/s and rad/s
-
-    @classmethod
-    def at_start(cls, settings: OdometrySettings, sensor: CalibrationSettings) -> Self:
-        """Make the belief at the first odometry stamp, with an empty map.
-
-        The priors of the sensor are wide: unlike a window, a filter cannot relinearize past errors.
-        """
-        calibration = np.array([*settings.sigmas, *sensor.widened().sigmas])
-        belief = cls(np.zeros(POSE), np.diag(np.square(settings.sigmas_start)), calibration)
-        known = np.array([*settings.means, *sensor.means])
-        belief.mean[POSE : POSE + len(known)] = known
-        return belief
 
     @property
     def pose(self) -> Array:

@@ -124,7 +124,12 @@ class _Filter(landmarks.OnlineBaseline):
     """Belief of both filters."""
 
     def _begin(self) -> None:
-        self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
+        # the priors of the sensor are wide: unlike a window, a filter cannot relinearize past errors
+        odometry, sensor = self.settings.odometry, self.settings.calibration
+        sigmas = np.array([*odometry.sigmas, *sensor.widened().sigmas])
+        self.belief = Belief(np.zeros(POSE), np.diag(np.square(odometry.sigmas_start)), sigmas)
+        known = self.settings.calibrations
+        self.belief.mean[POSE : POSE + len(known)] = known
 
     def vehicle_state(self) -> VehicleState:
         mean, covariance = self.belief.mean, self.belief.covariance

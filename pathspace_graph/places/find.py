@@ -8,7 +8,7 @@ has log odds against every rival: the other places, and that the vehicle is at n
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from math import inf, log
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -196,28 +196,19 @@ class SampledCurves:
 
         Iterated closest points minimize the sum of squares across the curves, with the prior.
         """
-        pairs = zip(prior.tried, prior.means, strict=True)
-        fits = [vars(self._fit(seen, start, mean, prior.information)).values() for start, mean in pairs]
-        return Fits(*map(np.concatenate, zip(*fits, strict=True)))
-
-    def _fit(self, seen: Constellation, start: Array, mean: Array, information: Array) -> Fits:
-        pose, H = start, np.zeros((3, 3))
-        for gate in (3.0, 2.0, 1.2, 0.7):  # largest distance from a curve, by iteration (m)
-            off, jacobian, variance, inside = self._rows(seen, pose)
-            weight = np.where(inside & (np.abs(off) < gate), seen.weight / variance, 0.0)
-            H = np.asarray((jacobian * weight[:, None]).T @ jacobian)
-            gradient = jacobian.T @ (weight * off) + information @ se2.difference(pose, mean)
-            pose = pose - np.linalg.solve(H + information, gradient)
-        off, _, variance, inside = self._rows(seen, pose)
-        squares = np.minimum(off**2 / variance, FIT_GATE)[inside]
-        away = se2.difference(pose, mean)
-        return Fits(
-            pose[None],
-            (H + REGULAR)[None],
-            np.array([seen.weight * squares.sum()]),
-            np.array([seen.weight * inside.sum()]),
-            np.array([away @ information @ away]),
-        )
+        found, information = list[tuple[Any, ...]](), prior.information
+        for pose, mean in zip(prior.tried, prior.means, strict=True):
+            for gate in (3.0, 2.0, 1.2, 0.7):  # largest distance from a curve, by iteration (m)
+                off, jacobian, variance, inside = self._rows(seen, pose)
+                weight = np.where(inside & (np.abs(off) < gate), seen.weight / variance, 0.0)
+                H = np.asarray((jacobian * weight[:, None]).T @ jacobian)
+                gradient = jacobian.T @ (weight * off) + information @ se2.difference(pose, mean)
+                pose = pose - np.linalg.solve(H + information, gradient)  # noqa: PLW2901
+            off, _, variance, inside = self._rows(seen, pose)
+            squares, away = np.minimum(off**2 / variance, FIT_GATE)[inside], se2.difference(pose, mean)
+            sums = seen.weight * squares.sum(), seen.weight * inside.sum(), away @ information @ away
+            found.append((pose, H + REGULAR, *sums))
+        return Fits(*map(np.array, zip(*found, strict=True)))
 
     def _rows(self, seen: Constellation, pose: Array) -> tuple[Array, Array, Array, BoolArray]:
         """Return signed distances (n,) across, derivatives (n, 3), variances (n,), and which are in view."""

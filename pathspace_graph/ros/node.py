@@ -36,7 +36,6 @@ STEP: Final = 1.0  # distance of the published points of a boundary (m)
 AHEAD: Final = 20.0  # distance up to which the road ahead is published (m)
 CENTRE: Final = 2  # identifier of the centre line among the lines
 COLOURS: Final = {LEFT: (0.0, 0.2, 1.0), RIGHT: (1.0, 0.9, 0.0), CENTRE: (1.0, 1.0, 1.0)}  # red, green, blue
-LINE_STRIP: Final = 4  # type of a `Marker` that is a line
 MOST_POSES: Final = 1000  # number of poses of the published path, by default
 
 
@@ -204,16 +203,6 @@ def curve_points(track: Map) -> dict[int, Array]:
     return points
 
 
-def fill_line(marker: Any, points: Array, label: int, make_point: Any) -> Any:
-    """Fill a `Marker` with a line through points (n, 2)."""
-    marker.ns, marker.id, marker.type = "track", label, LINE_STRIP
-    marker.scale.x, marker.pose.orientation.w = 0.1, 1.0
-    colour = marker.color
-    (colour.r, colour.g, colour.b), colour.a = COLOURS[label], 1.0
-    marker.points = [make_point(x=x, y=y, z=0.0) for x, y in points.tolist()]
-    return marker
-
-
 def fill_pose(position: Any, orientation: Any, pose: Array) -> None:
     """Fill the position and the quaternion of a message with a pose (3,)."""
     position.x, position.y = pose[:2].tolist()
@@ -240,7 +229,13 @@ def publisher(
     poses = deque[Any](maxlen=max(most, 1))
 
     def lines(points: dict[int, Array], header: Any) -> Any:
-        markers = [fill_line(Marker(header=header), points[label], label, Point) for label in points]
+        markers = []
+        for label, own in points.items():
+            marker = Marker(header=header, ns="track", id=label, type=Marker.LINE_STRIP)
+            marker.scale.x, marker.pose.orientation.w = 0.1, 1.0
+            (marker.color.r, marker.color.g, marker.color.b), marker.color.a = COLOURS[label], 1.0
+            marker.points = [Point(x=x, y=y, z=0.0) for x, y in own.tolist()]
+            markers.append(marker)
         return MarkerArray(markers=markers)
 
     def publish(result: CycleResult) -> None:

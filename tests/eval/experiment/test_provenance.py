@@ -98,7 +98,7 @@ def study(tmp_path: Path, **of: Any) -> Study:
 def test_the_code_of_an_estimator_has_what_it_imports_and_no_other_estimator() -> None:
     code = code_of("ckf")
     ours = {name.removeprefix("pathspace_graph.") for name in code}
-    assert {"baselines.filters", "baselines.ckf_curves", "factors._kernels", "run", "sim.simulate"} <= ours
+    assert {"baselines.filters", "baselines.ckf", "factors._kernels", "run", "sim.simulate"} <= ours
     assert {"eval.metrics.measures", "settings.mapper", "gtsam", "numpy", "scipy"} <= ours
     assert not {"online.fixed_lag", "pandas", "sim.track_files"} & ours
     assert "online.fixed_lag" in {name.removeprefix("pathspace_graph.") for name in code_of("fixed-lag")}
