@@ -52,11 +52,11 @@ GROUPS: Final = {
         "batch": Entry("runs:Batch", "estimate", "Optimize whole logs at once, as the ground reference."),
         "plot": Entry("runs:Plot", "pictures", "Draw a map with its uncertainty band."),
         "view": Entry("runs:View", "pictures", "Write a result as a page for any browser."),
-        "export": Entry("runs:Export", "data", "Write a map as planners and other tools read it."),
+        "export": Entry("runs:Export", "export", "Write a map as planners and other tools read it."),
     },
     "Data": {
-        "simulate": Entry("data:Simulate", "data", "Write the log of a simulated drive, with truth."),
-        "convert": Entry("data:Convert", "data", "Write a ROS bag, CSV files or JSON lines as a log."),
+        "simulate": Entry("data:Simulate", "simulate", "Write the log of a simulated drive, with truth."),
+        "convert": Entry("data:Convert", "convert", "Write a ROS bag, CSV files or JSON lines as a log."),
     },
     "Studies": {
         "compare": Entry("runs:Compare", "studies", "Run every estimator on logs: the paper's table."),

@@ -1,10 +1,9 @@
 """`online` and `batch`: map a log cycle by cycle, without reading ahead, or optimize it at once."""
 
-import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
 from itertools import count
@@ -28,7 +27,7 @@ from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.graph.exchange import GRAPH_FILE, write_graph
 from pathspace_graph.health import DEGRADED, LOST, counts
-from pathspace_graph.io.files import atomic_file, check_target, to_plain
+from pathspace_graph.io.files import atomic_file, check_target
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map, as_ribbon, read_map
 from pathspace_graph.io.results import BatchRun, RunResult, write_result
@@ -45,26 +44,9 @@ from pathspace_graph.sim.track import EVENTS
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.spline.boundary import crossings_told
 
+from .simulate import Outcome, tell
+
 Run = TypeVar("Run", bound=RunResult)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The end of a command."""
-
-    written: Sequence[Path]
-    summary: Mapping[str, Any] = field(default_factory=dict)
-    wrong: Sequence[str] = ()  # a line each, and exit code 3; empty for a trustworthy result
-
-    def show(self, *, as_json: bool) -> None:
-        """Print the summary as JSON, or the paths of the files; objections go to standard error."""
-        files = [path for path in self.written if path.is_file() or path.is_dir()]  # no pipe or terminal
-        if as_json and (files or self.summary):
-            content = to_plain({**self.summary, "written": files, "wrong": self.wrong})
-            print(json.dumps(content, indent=2, allow_nan=False))
-        elif files:
-            say(f"written to {', '.join(map(str, files))}")
-        note(*self.wrong)
 
 
 def read_known_map(path: Path, sigma: float, settings: MapperSettings) -> tuple[Map, Array | None]:
@@ -271,11 +253,6 @@ def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> d
         return found
     found |= {"convergence": asdict(result.convergence), "objection": result.objection}
     return found | {"stages": result.seconds}
-
-
-def tell(hints: Sequence[Hint], of: str = "") -> None:
-    """Print a line for each hint on standard error, with the name of its log, if given."""
-    note(*(f"hint: {of}{'/' if of else ''}{hint.line}" for hint in hints))
 
 
 def map_online(

@@ -19,7 +19,7 @@ from pathspace_graph.io.results import CYCLES_FILE, SMOOTHED_FILE, TRAJECTORY_FI
 from pathspace_graph.io.tables import read_trajectory
 from pathspace_graph.options.runs import Plot, View
 
-from .estimate import Outcome
+from .simulate import Outcome
 
 SUMMARY_FILE: Final = "summary.json"
 

@@ -33,8 +33,8 @@ from pathspace_graph.options.runs import Ablate, Compare, Demo, FaultSuite, Repo
 from pathspace_graph.settings.mapper import ScalingSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
-from .data import describe, generated_track
-from .estimate import Outcome, map_online, outline, tell
+from .estimate import map_online, outline
+from .simulate import Outcome, describe, generated_track, tell
 
 
 def execute(

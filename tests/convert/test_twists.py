@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.commands.data import with_measured_noise
+from pathspace_graph.commands.convert import with_measured_noise
 from pathspace_graph.convert import recording
 from pathspace_graph.convert.recording import strays
 from pathspace_graph.factors.odometry import integrate_poses
