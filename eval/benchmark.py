@@ -30,8 +30,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.mapping.motion import integrate_odometry
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import ObservedCycle, run_online, split_odometry, timed_update, timed_wait
-from pathspace_graph.settings.evaluation import CONES_MIN, ScalingSettings
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import CONES_MIN, MapperSettings, ScalingSettings
 from pathspace_graph.sim.sensor import LINE, LineSettings, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track, along_polyline, arc_lengths, unit

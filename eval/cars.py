@@ -30,8 +30,7 @@ from pathspace_graph.io.map import Map, read_map
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.places.find import SURE_ODDS, KnownRoad
-from pathspace_graph.places.passes import STRETCH, place_on, seen_in
+from pathspace_graph.places.find import STRETCH, SURE_ODDS, KnownRoad, place_on, seen_in
 from pathspace_graph.run import run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate

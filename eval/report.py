@@ -17,8 +17,7 @@ import pandas as pd
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.io.parsing import parse_toml, read_text
-from pathspace_graph.settings.evaluation import ScalingSettings
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings, ScalingSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 

@@ -58,7 +58,7 @@ class _Link(Protocol):
     def noise(self) -> Array: ...
 
 class _MotionSettings(Protocol):
-    """What is read of `settings.online:MotionSettings`."""
+    """What is read of `settings.mapper:MotionSettings`."""
 
     @property
     def doubt(self) -> float: ...

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pathspace_graph.baselines.filters import CkfMapper, LandmarkCkf
-    from pathspace_graph.baselines.landmark_batch import LandmarkBatch
-    from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
+    from pathspace_graph.baselines.landmark_graph import LandmarkBatch, LandmarkFixedLag
     from pathspace_graph.batch.mapper import BatchMapper
     from pathspace_graph.io.log import Detections, Log, Odometry
     from pathspace_graph.io.log_files import read_log, write_log
@@ -46,8 +45,7 @@ _HOMES = {
     "io.map": ("Map", "PointBoundary", "SplineBoundary", "read_map"),
     "io.results": ("CycleRecord", "RunResult", "write_result"),
     "labels": ("LEFT", "RIGHT"),
-    "baselines.landmark_batch": ("LandmarkBatch",),
-    "baselines.landmark_fixed_lag": ("LandmarkFixedLag",),
+    "baselines.landmark_graph": ("LandmarkBatch", "LandmarkFixedLag"),
     "online.fixed_lag": ("FixedLagMapper",),
     "plausibility.judge": ("Hint", "hints"),
     "run": ("run_online", "split_odometry"),

@@ -10,12 +10,17 @@ from dataclasses import asdict
 from importlib import import_module
 from itertools import takewhile
 from traceback import print_exc
-from typing import Any, Final, Literal, NamedTuple, cast, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, cast, get_args
 
 import cyclopts
 from cyclopts import App, ArgumentCollection
+from cyclopts.help.formatters import DefaultFormatter
 
 from .errors import PathspaceError, SolveError, check_name, install
+
+if TYPE_CHECKING:
+    from cyclopts.help import HelpEntry, HelpPanel
+    from rich.console import Console, ConsoleOptions
 
 PROGRAM: Final = "pathspace-graph"
 DONE, BAD_INPUT, NOT_SOLVED, INTERRUPTED, BROKEN_PIPE, TERMINATED = 0, 2, 3, 130, 141, 143  # exit codes
@@ -24,6 +29,10 @@ HELP_ALL: Final = "--help-all"
 HELP: Final = ("--help", "-h", HELP_ALL)
 PARAMETER: Final = cyclopts.Parameter(
     consume_multiple=1, negative_iterable=(), json_dict=False, json_list=False
+)
+ESSENTIAL: Final = (  # options of groups that `--help` explains; the others are in `--help-all`
+    *("--limits.range-max", "--spline.degree", "--spline.size-share", "--motion.doubt", "--sides.colourless"),
+    *("--batch.start", "--odometry.sigma-scale", "--calibration.sensor", "--calibration.trust"),
 )
 WHOLE: Final = re.compile(r"[+-]?\d{1,18}|none", re.IGNORECASE)  # cyclopts would round any other number
 
@@ -38,11 +47,11 @@ class Entry(NamedTuple):
 
 GROUPS: Final = {
     "Maps": {
-        "demo": Entry("runs:Demo", "compare", "Map a generated track online: a table, a map, its picture."),
+        "demo": Entry("runs:Demo", "studies", "Map a generated track online: a table, a map, its picture."),
         "online": Entry("runs:Online", "estimate", "Map a log online, cycle by cycle."),
         "batch": Entry("runs:Batch", "estimate", "Optimize whole logs at once, as the ground reference."),
-        "plot": Entry("runs:Plot", "plot", "Draw a map with its uncertainty band."),
-        "view": Entry("runs:View", "view", "Write a result as a page for any browser."),
+        "plot": Entry("runs:Plot", "pictures", "Draw a map with its uncertainty band."),
+        "view": Entry("runs:View", "pictures", "Write a result as a page for any browser."),
         "export": Entry("runs:Export", "export", "Write a map as planners and other tools read it."),
     },
     "Data": {
@@ -50,7 +59,7 @@ GROUPS: Final = {
         "convert": Entry("data:Convert", "convert", "Write a ROS bag, CSV files or JSON lines as a log."),
     },
     "Studies": {
-        "compare": Entry("runs:Compare", "compare", "Run every estimator on logs: the paper's table."),
+        "compare": Entry("runs:Compare", "studies", "Run every estimator on logs: the paper's table."),
         "ablate": Entry("runs:Ablate", "studies", "Run a study of estimators and settings."),
         "faults": Entry("runs:FaultSuite", "studies", "Measure what each fault of a car costs."),
         "scale": Entry("runs:Scale", "studies", "Measure update time against map size."),
@@ -108,7 +117,7 @@ def parse(words: Sequence[str]) -> tuple[str, Any]:
         words = [name, *before, *rest]
     app = application(name)
     if name != ASK_COMPLETION and (not words or not set(HELP).isdisjoint(words)):
-        app.help_formatter = import_module(".options.help", __package__).Help(short=HELP_ALL not in words)
+        app.help_formatter = Help(short=HELP_ALL not in words)
         app.help_print([name] if name else [], console=import_module(".console", __package__).output())
         return name, None
     if before == ["--completion"]:
@@ -141,6 +150,27 @@ def application(name: str = "") -> App:
             path = f"{__package__}.options.{command.options}"
             app.command(path, name=one, help=summary, group=group)
     return app
+
+
+class Help(DefaultFormatter):
+    """Help with every option, or if `short` without most options of groups, whose names stand below it."""
+
+    def __init__(self, short: bool) -> None:
+        super().__init__()
+        self.short = short
+
+    def __call__(self, console: "Console", options: "ConsoleOptions", panel: "HelpPanel") -> None:
+        shown, hidden = list["HelpEntry"](), dict[str, None]()
+        for entry in panel.entries:
+            name = "".join(entry.positive_names[:1])
+            if self.short and "." in name and name not in ESSENTIAL:
+                hidden[f"{name.split('.')[0]}.*"] = None
+            else:
+                text = " ".join(entry.description.primary_renderable.plain.split())
+                shown.append(entry.copy(description=text.split(". ")[0] if self.short else text))
+        super().__call__(console, options, panel.copy(entries=shown))
+        if hidden:
+            console.print(f"--help-all also explains {', '.join(hidden)}", highlight=False, markup=False)
 
 
 def _version() -> str:

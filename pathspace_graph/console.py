@@ -1,27 +1,19 @@
 """What a command prints: results on standard output, hints and the progress of long work on the other."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import timedelta
-from enum import IntEnum
 from importlib.util import find_spec
-from typing import Final
+from typing import Final, Literal
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
-
-class Verbosity(IntEnum):
-    """How much is printed; hints and errors always are."""
-
-    QUIET = -1  # no results and no progress
-    NORMAL = 0
-    VERBOSE = 1  # progress in lines where there is no terminal, and the traceback of an error
-
-
-VERBOSITY: Final = ContextVar("verbosity", default=Verbosity.NORMAL)
+# How much is printed; hints and errors always are. QUIET is no results and no progress, VERBOSE is progress
+# in lines where there is no terminal, and the traceback of an error.
+VERBOSITY: Final = ContextVar("verbosity", default="NORMAL")
 FILE_WIDTH: Final = 160  # width of tables where the output is no terminal (characters)
 LINES: Final = 20  # about the number of lines of progress, where they are printed
 
@@ -33,8 +25,8 @@ class _Output(Console):
 
 
 @contextmanager
-def verbosity(level: str) -> Iterator[None]:
-    before = VERBOSITY.set(Verbosity[level])
+def verbosity(level: Literal["QUIET", "NORMAL", "VERBOSE"]) -> Iterator[None]:
+    before = VERBOSITY.set(level)
     try:
         yield
     finally:
@@ -43,7 +35,7 @@ def verbosity(level: str) -> Iterator[None]:
 
 def output(wide: bool = False) -> Console:
     """Console for results; tables are `FILE_WIDTH` wide in a file if `wide`."""
-    quiet = VERBOSITY.get() == Verbosity.QUIET
+    quiet = VERBOSITY.get() == "QUIET"
     console = _Output(quiet=quiet)
     return _Output(quiet=quiet, width=FILE_WIDTH) if wide and not console.is_terminal else console
 
@@ -59,49 +51,42 @@ def say(*lines: str, console: Console | None = None) -> None:
 
 
 @contextmanager
-def progress(description: str, total: int | None = None, lines: int = 0) -> "Iterator[Steps]":
-    """Show a bar on a terminal, or a spinner without a total, and yield what counts the steps.
+def progress(description: str, total: int | None = None, lines: int = 0) -> Iterator[Callable[..., None]]:
+    """Show a bar on a terminal, or a spinner without a total, and yield the function that counts a step.
+
+    With arguments that function sets how many steps of how many are done. It tells the time that remains by
+    the mean of the steps.
 
     A notebook shows the same bar with ipywidgets, and lines without. Elsewhere nothing is shown, unless
     `lines` asks for about that many lines.
     """
     level, console = VERBOSITY.get(), Console(stderr=True, highlight=False)
-    lines = {Verbosity.QUIET: 0, Verbosity.VERBOSE: LINES}.get(level, lines)
+    lines = {"QUIET": 0, "VERBOSE": LINES}.get(level, lines)
     has_bar = console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
-    if console.is_jupyter and not has_bar and level != Verbosity.QUIET:
+    if console.is_jupyter and not has_bar and level != "QUIET":
         lines = lines or LINES
     text, remaining = (
         TextColumn(f"{{task.{name}}}", markup=False) for name in ("description", "fields[remaining]")
     )
     columns = (SpinnerColumn(), text, BarColumn(), MofNCompleteColumn(), remaining)
     shown = columns if total is not None or lines else columns[:2]
-    hidden = level == Verbosity.QUIET or not has_bar
+    hidden = level == "QUIET" or not has_bar
     with Progress(*shown, console=console, transient=True, disable=hidden) as display:
-        yield Steps(display, description, total, lines)
+        begin, steps = time.monotonic(), 0
+        task = display.add_task(description, total=total, remaining="")
 
+        def step(done: int | None = None, of: int | None = None) -> None:
+            nonlocal steps, total
+            steps, total = steps + 1 if done is None else done, total if of is None else of
+            remaining = ""
+            if total is not None:
+                remaining = "time left unknown"
+                if steps:
+                    mean = (time.monotonic() - begin) / steps
+                    remaining = f"{timedelta(seconds=round(mean * (total - steps)))} left"
+            display.update(task, completed=steps, total=total, remaining=remaining)
+            is_due = lines and total and (steps % -(-total // lines) == 0 or steps == total)
+            if is_due and not console.is_terminal:
+                console.print(f"{description}: {steps} of {total}, {remaining}", markup=False)
 
-class Steps:
-    """Counter of the steps of long work, which estimates the time that remains by their mean."""
-
-    def __init__(self, display: Progress, description: str, total: int | None, lines: int) -> None:
-        self._display, self._description = display, description
-        self._done, self._total, self._lines = 0, total, lines
-        self._begin = time.monotonic()
-        self._task = display.add_task(description, total=total, remaining="")
-
-    def __call__(self, done: int | None = None, total: int | None = None) -> None:
-        """Count one more step, or set how many steps of how many are done."""
-        self._done = self._done + 1 if done is None else done
-        self._total = self._total if total is None else total
-        remaining = ""
-        if self._total is not None:
-            remaining = "time left unknown"
-            if self._done:  # by the mean of the steps
-                mean = (time.monotonic() - self._begin) / self._done
-                remaining = f"{timedelta(seconds=round(mean * (self._total - self._done)))} left"
-        self._display.update(self._task, completed=self._done, total=self._total, remaining=remaining)
-        if self._lines and self._total and not self._display.console.is_terminal:
-            interval = -(-self._total // self._lines)
-            if self._done % interval == 0 or self._done == self._total:
-                text = f"{self._description}: {self._done} of {self._total}, {remaining}"
-                self._display.console.print(text, markup=False)
+        yield step

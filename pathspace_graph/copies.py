@@ -1,7 +1,7 @@
 """Copies of mutable objects, which a mapper makes in every cycle."""
 
 from functools import cache
-from typing import Any, Self, TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -23,17 +23,13 @@ class Copyable:
         other = shallow(self)
         attributes = other.__dict__
         for name, value in attributes.items():
-            if _is_mutable(value.__class__):
-                attributes[name] = _copied(value)
+            if isinstance(value, dict):
+                attributes[name] = {k: v.copy() if _is_mutable(v.__class__) else v for k, v in value.items()}
+            elif _is_mutable(value.__class__):
+                attributes[name] = value.copy()
         return other
 
 
 @cache  # a copy of a mapper asks it two hundred times
 def _is_mutable(kind: type) -> bool:
     return hasattr(kind, "copy") and not issubclass(kind, np.ndarray | np.generic)
-
-
-def _copied(value: Any) -> Any:
-    if not isinstance(value, dict):
-        return value.copy()
-    return {key: own.copy() if _is_mutable(own.__class__) else own for key, own in value.items()}

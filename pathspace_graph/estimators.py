@@ -13,10 +13,10 @@ from typing import Any, Final
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.io.log import Log
-from pathspace_graph.io.overrides import override
 from pathspace_graph.mapping.motion import known_noise
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.settings.mapper import MapperSettings, known_settings
+from pathspace_graph.settings.checked import override
+from pathspace_graph.settings.mapper import BATCH_NAMES, ONLINE_NAMES, MapperSettings, known_settings
 
 from .errors import SettingsError, check_name, check_type
 from .run import BatchEstimator, OnlineEstimator
@@ -24,8 +24,8 @@ from .run import BatchEstimator, OnlineEstimator
 MakeOnline = Callable[..., OnlineEstimator]  # of settings, known noise and, where it has any, its parameters
 MakeBatch = Callable[..., BatchEstimator]
 
-DEFAULT_ONLINE: Final = "fixed-lag"  # online estimator where none is named
-DEFAULT_BATCH: Final = "spline"  # batch estimator where none is named
+DEFAULT_ONLINE: Final = ONLINE_NAMES[0]  # online estimator where none is named
+DEFAULT_BATCH: Final = BATCH_NAMES[0]  # batch estimator where none is named
 ONLINE_GROUP: Final = "pathspace_graph.online"  # group of entry points that add online estimators
 BATCH_GROUP: Final = "pathspace_graph.batch"  # group of entry points that add batch estimators
 ALWAYS_READ: Final = ("kind", "limits", "calibration", "odometry")
@@ -60,26 +60,25 @@ class Elsewhere:
         return self.maker(*arguments)
 
 
-def _installed(group: str) -> dict[str, Elsewhere]:
-    return {point.name: Elsewhere(point) for point in _ENTRY_POINTS.select(group=group)}
-
-
-def _baseline(name: str, place: str) -> Elsewhere:
-    return Elsewhere(EntryPoint(name, f"{__package__}.baselines.{place}", ONLINE_GROUP))
-
-
+_BASELINES: Final = {
+    name: Elsewhere(EntryPoint(name, f"{__package__}.baselines.{place}", ""))
+    for name, place in (
+        ("landmark-fixed-lag", "landmark_graph:LandmarkFixedLag"),
+        ("ckf", "filters:CkfMapper"),
+        ("landmark-ckf", "filters:LandmarkCkf"),
+        ("landmark-batch", "landmark_graph:LandmarkBatch"),
+    )
+}
 ONLINE: Final[dict[str, MakeOnline]] = {
-    **_installed(ONLINE_GROUP),
+    **{point.name: Elsewhere(point) for point in _ENTRY_POINTS.select(group=ONLINE_GROUP)},
     DEFAULT_ONLINE: FixedLagMapper,
-    "landmark-fixed-lag": _baseline("landmark-fixed-lag", "landmark_fixed_lag:LandmarkFixedLag"),
-    "ckf": _baseline("ckf", "filters:CkfMapper"),
-    "landmark-ckf": _baseline("landmark-ckf", "filters:LandmarkCkf"),
+    **{name: _BASELINES[name] for name in ONLINE_NAMES[1:]},
 }
 
 BATCH: Final[dict[str, MakeBatch]] = {
-    **_installed(BATCH_GROUP),
+    **{point.name: Elsewhere(point) for point in _ENTRY_POINTS.select(group=BATCH_GROUP)},
     DEFAULT_BATCH: lambda settings, noise: BatchMapper(settings, noise, FixedLagMapper),
-    "landmark-batch": _baseline("landmark-batch", "landmark_batch:LandmarkBatch"),
+    **{name: _BASELINES[name] for name in BATCH_NAMES[1:]},
 }
 
 

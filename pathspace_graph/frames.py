@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import pandas as pd
 
-from pathspace_graph.io.parsing import MAX_STAMP, Table
+from pathspace_graph.io.parsing import MAX_STAMP
 from pathspace_graph.io.results import CYCLE_COLUMNS, CYCLES_FILE, RunResult
 from pathspace_graph.io.tables import read_table
 
@@ -30,17 +30,15 @@ def read_cycles(folder: Path | str) -> pd.DataFrame:
     """Read the cycles of a run's folder, with the cycle as index; InputError on a wrong file."""
     file = Path(folder) / CYCLES_FILE
     table = read_table(file, [name for name in CYCLE_COLUMNS if name not in OPTIONAL])
-    columns = {name: _column(table, name, CYCLE_COLUMNS.get(name, "str")) for name in table.columns}
+    columns = {}
+    for name, values in table.columns.items():
+        kind = CYCLE_COLUMNS.get(name, "str")
+        if kind != "str":
+            values = table.numbers(name, MAX_STAMP if name == "t" else None)  # noqa: PLW2901
+        if kind == "int64":
+            table.require(values == values.round(), f"expected whole numbers in column '{name}'")
+        columns[name] = pd.Series(values, dtype=kind)
     return pd.DataFrame(columns).set_index("cycle")
-
-
-def _column(table: Table, name: str, kind: str) -> pd.Series:
-    if kind == "str":
-        return pd.Series(table.columns[name], dtype="str")
-    values = table.numbers(name, MAX_STAMP if name == "t" else None)
-    if kind == "int64":
-        table.require(values == values.round(), f"expected whole numbers in column '{name}'")
-    return pd.Series(values).astype(kind)
 
 
 def run_frame(result: RunResult) -> pd.DataFrame:

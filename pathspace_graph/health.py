@@ -97,19 +97,17 @@ class HealthMonitor(Copyable):
 
     def _wrong_side(self) -> str:
         """Name a wrong boundary, if the other one explains its detections, or was the last to do so."""
-        holds = [self._holds(label) for label in BOUNDARIES]
+        holds = list[bool | None]()  # None with too few detections
+        for label in BOUNDARIES:
+            offered = sum(one.offered_by[label] for one in self._recent)
+            explained = sum(one.explained_by[label] for one in self._recent)
+            enough = offered >= MIN_OFFERED / len(BOUNDARIES)
+            holds.append(explained >= SHARE_DEGRADED * offered if enough else None)
         if True in holds:
             self._wrong = 1 - holds.index(True)
         elif self._wrong is not None and holds[1 - self._wrong] is False:
             self._wrong = None
         return "" if self._wrong is None else f"the {NAMES[self._wrong]} boundary is not where the map has it"
-
-    def _holds(self, label: int) -> bool | None:
-        offered = sum(one.offered_by[label] for one in self._recent)
-        explained = sum(one.explained_by[label] for one in self._recent)
-        if offered < MIN_OFFERED / len(BOUNDARIES):
-            return None
-        return explained >= SHARE_DEGRADED * offered
 
     def _judge(self, newest: Evidence, share: float, innovation: float, most: float) -> Health:
         lost = SHARE_LOST if newest.closed else 0.0  # on an open map dead reckoning suffices

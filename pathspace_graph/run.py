@@ -16,9 +16,9 @@ import gtsam
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pathspace_graph.brief import Brief
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.linear import keys_of_factor
-from pathspace_graph.io.brief import Brief
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult

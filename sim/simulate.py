@@ -20,10 +20,9 @@ from pathspace_graph.io.log import (
     Truth,
     ray_covariances,
 )
-from pathspace_graph.io.overrides import leaves
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.lengths import scaled
-from pathspace_graph.settings.checked import Checked
+from pathspace_graph.settings.checked import Checked, leaves
 
 from .cameras import CAMERA, CAMERA_FAULTS, INS, INS_RATE, draw_car
 from .faults import (

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import scipy  # which imports its modules when they are used
 
+from pathspace_graph.brief import Brief
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import left_of
-from pathspace_graph.io.brief import Brief
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT, UNKNOWN
 
 if TYPE_CHECKING:

@@ -31,11 +31,11 @@ from pathspace_graph.cli import COMMANDS, main, parse
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import read_map
-from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.results import write_result
 from pathspace_graph.io.tables import read_trajectory
 from pathspace_graph.labels import NAMES
 from pathspace_graph.run import run_online, split_odometry
+from pathspace_graph.settings.checked import leaves
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track

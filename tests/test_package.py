@@ -146,7 +146,7 @@ def test_the_package_itself_imports_nothing_but_the_standard_library() -> None:
 def test_the_simulator_knows_no_estimator() -> None:
     loaded = modules_after("import pathspace_graph.sim.simulate, pathspace_graph.sim.track_generator")
     ours = {name for name in loaded if name.startswith("pathspace_graph.")}
-    allowed = {"errors", "factors", "io", "labels", "lengths", "settings", "spline"}
+    allowed = {"brief", "errors", "factors", "io", "labels", "lengths", "settings", "spline"}
     assert {name.split(".")[1] for name in ours} - {"sim"} <= allowed
     assert "gtsam" not in loaded
 

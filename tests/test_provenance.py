@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pathspace_graph import provenance
+from pathspace_graph.io import results as provenance
 
 
 def git(folder: Path, *words: str) -> str:
@@ -34,6 +34,6 @@ def test_a_commit_is_that_of_the_folder_and_says_where_something_differs(tmp_pat
 def test_what_is_installed_has_a_version_even_inside_a_repository(
     folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(provenance, "__file__", str(tmp_path / folder / "provenance.py"))
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / folder / "io" / "results.py"))
     monkeypatch.setattr(provenance, "commit_of", lambda at: "abc" if "lib" in at.parts else "")
     assert provenance.made()["commit"] == f"version {version('pathspace-graph')}"

@@ -17,16 +17,19 @@ EXTRAS = {"distributed", "rerun", "rosbags", "builtin_interfaces"} | ROS
 """Optional packages, which are imported only where they are needed."""
 
 LATE = {
-    "commands.estimate": {"eval.view.recording", "commands.plot"},
-    "options.runs": {"io.overrides"},
-    "io.brief": {"eval.figures.map_plot", "eval.figures.notebook", "frames"},
-    "settings.checked": {"io.brief"},
+    "commands.estimate": {"eval.view.recording", "commands.pictures"},
+    "commands.pictures": {"eval.view.page"},
+    "options.runs": {"io.parsing"},
+    "brief": {"eval.figures.notebook"},
+    "io.log": {"eval.figures.map_plot"},
+    "io.map": {"eval.figures.map_plot"},
+    "io.results": {"eval.figures.notebook", "frames"},
 }
 """Modules that are imported by name when needed, since matplotlib is slow."""
-ASKED = {"io.brief", "settings.checked"}
+ASKED = {"brief", "io.log", "io.map", "io.results"}
 """Modules that import from above by name where a user asks a record for its picture or its frame."""
 
-LEAVES = {"errors", "labels", "console", "lengths", "copies", "provenance"}
+LEAVES = {"errors", "labels", "console", "lengths", "copies", "brief"}
 """Modules that any room may import; `errors` is the only one that they import themselves."""
 ESTIMATORS = {"online", "batch", "baselines"}
 BELOW_MAPPING = {
@@ -190,14 +193,13 @@ ASSIGNED = {
     "baselines.filters": {"state.pose_u"},
     "graph.smoother": {f"smoother.{part}" for part in ("prior", "inactive", "held", "calibration_prior")}
     | {"smoother.variables.first_cycle", "self.variables.first_cycle"},
-    "baselines.landmark_association": {"detections.landmark"},
-    "baselines.landmark_batch": {"state.votes", "detections.landmark"},
-    "baselines.landmark_fixed_lag": {"self.smoother.window.exact", "state.votes", "state.next_number"},
+    "baselines.landmarks": {"detections.landmark"},
+    "baselines.landmark_graph": {"self.smoother.window.exact", "detections.landmark"}
+    | {f"state.{part}" for part in ("votes", "next_number")},
     "mapping.road": {"self.smoother.attached"},
     "mapping.smoother": {"self.window.exact"},
-    "ros.node": {f"marker.{part}" for part in ("ns", "id", "type", "points", "scale.x", "pose.orientation.w")}
+    "ros.node": {f"marker.{part}" for part in ("scale.x", "pose.orientation.w", "color.a")}
     | {
-        "colour.a",
         "position.x",
         "position.y",
         "orientation.z",

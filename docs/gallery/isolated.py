@@ -9,12 +9,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.linalg import block_diag
 
-from pathspace_graph.baselines.ckf_curves import beyond_end, fit_detections, proximity_chain
+from pathspace_graph.baselines.ckf import beyond_end, fit_detections, proximity_chain
 from pathspace_graph.baselines.filters import curvature_weighted_breaks
 from pathspace_graph.factors.residuals import greville, smoothness_matrix
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
-from pathspace_graph.spline.bspline import BSpline, end_change_matrix
-from pathspace_graph.spline.knots import SAMPLED_WEIGHT, LeastSquares, fit_spline
+from pathspace_graph.spline.bspline import (
+    SAMPLED_WEIGHT,
+    BSpline,
+    LeastSquares,
+    end_change_matrix,
+    fit_spline,
+)
 
 
 def posterior(spline, seen, sigma_bend, sigma_anchor, sigma_detection=0.3):

@@ -20,9 +20,9 @@ from pathspace_graph.eval.metrics.summary import has_cones, versions
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.map import Map, read_map
-from pathspace_graph.io.overrides import Overrides
 from pathspace_graph.io.results import SMOOTHED_FILE, TRAJECTORY_FILE
 from pathspace_graph.io.tables import read_trajectory
+from pathspace_graph.settings.checked import Overrides
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .run import EstimatorCell, Plan, Record, add_batch, make_plan, run_folder, run_records

@@ -16,7 +16,7 @@ from typing import Any, Final
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.eval.metrics.summary import versions
-from pathspace_graph.provenance import commit_of, machine, now
+from pathspace_graph.io.results import commit_of, machine, now
 
 HOUSE: Final = __name__.partition(".")[0]
 MEASURED: Final = (  # modules on which every result depends, whatever the estimator is

@@ -22,22 +22,22 @@ from joblib import Parallel, delayed, parallel_config
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph import estimators as registry
+from pathspace_graph.brief import Brief
 from pathspace_graph.errors import InputError, OutputError, SettingsError, SolveError, install
 from pathspace_graph.eval.metrics.alignment import aligned_distance
 from pathspace_graph.eval.metrics.measures import METRICS, measure, online_cycles, stage_times
 from pathspace_graph.eval.metrics.summary import has_cones, lap_times, summarize, versions
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
-from pathspace_graph.io.brief import Brief
 from pathspace_graph.io.files import atomic_folder, check_target, to_plain, write_json, write_text
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
-from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.parsing import read_json, shown
 from pathspace_graph.io.results import RunResult, write_result
 from pathspace_graph.lengths import times
 from pathspace_graph.loop.worker import end_with
 from pathspace_graph.plausibility.diagnosis import diagnose
 from pathspace_graph.run import run_online, with_own
+from pathspace_graph.settings.checked import leaves
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import Track
 

@@ -19,11 +19,10 @@ from pathspace_graph.eval.figures.notebook import table
 from pathspace_graph.eval.metrics.measures import METRICS
 from pathspace_graph.io.files import is_temporary
 from pathspace_graph.io.log import FILES, LOG_FILE, Log
-from pathspace_graph.io.overrides import Overrides, apart, flatten, override
 from pathspace_graph.io.parsing import MAX_HEADER_BYTES, parse_toml, read_text, shown
 from pathspace_graph.plausibility.judge import Hint, read_plausible_log
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.settings.checked import Overrides, apart, flatten, override
+from pathspace_graph.settings.mapper import LimitSettings, MapperSettings
 from pathspace_graph.sim.simulate import PLAIN, PRESETS, SimulationSettings, preset, simulate
 from pathspace_graph.sim.track import EVENTS, Track
 from pathspace_graph.sim.track_files import read_track

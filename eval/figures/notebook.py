@@ -14,10 +14,9 @@ from pathspace_graph.eval.metrics.summary import health_of, summarize
 from pathspace_graph.health import CONDITIONS, Health, stretches
 from pathspace_graph.io.log import Log, Odometry, Truth
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.overrides import leaves
 from pathspace_graph.io.results import RunResult
 from pathspace_graph.plausibility.judge import Hint
-from pathspace_graph.settings.checked import Checked
+from pathspace_graph.settings.checked import Checked, leaves
 
 from .map_plot import HEALTH_COLORS, TRAJECTORY_COLOR
 

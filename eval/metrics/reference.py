@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pathspace_graph.baselines.landmark_map import LandmarkState, LandmarkSystem, solve_landmarks
+from pathspace_graph.baselines.landmarks import LandmarkState, LandmarkSystem, solve_landmarks
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.io.log import Detections, Log, Truth, ray_covariances
 from pathspace_graph.labels import BOUNDARIES
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import CalibrationSettings
+from pathspace_graph.settings.mapper import CalibrationSettings, MapperSettings
 
 from .accuracy import root_mean_square
 

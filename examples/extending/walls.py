@@ -6,7 +6,7 @@ from pathspace_graph import Detections, MapperSettings
 from pathspace_graph.io.log import ray_covariances
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import CalibrationSettings
-from pathspace_graph.settings.online import MotionSettings
+from pathspace_graph.settings.mapper import MotionSettings
 
 SETTINGS = MapperSettings(motion=MotionSettings(doubt=inf), calibration=CalibrationSettings(sensor=False))
 

@@ -1,11 +1,11 @@
-// Seen cones laid on known ones (`places/constellation.py`).
+// Seen cones laid on known ones (`places/find.py`).
 
 #include "common.hpp"
 
 namespace kernels {
 namespace {
 
-struct ConePoints {  // places.constellation:ConeArrays
+struct ConePoints {  // places.find:Constellation.cones
   ConePoints() = default;
   explicit ConePoints(const py::tuple& columns) {
     const auto points = columns[0].cast<Array>(), covariances = columns[1].cast<Array>();
@@ -42,7 +42,7 @@ struct ConePoints {  // places.constellation:ConeArrays
   Index n = 0;
 };
 
-struct LayLimits {  // places.constellation:FIT_LIMITS
+struct LayLimits {  // places.find:FIT_LIMITS
   explicit LayLimits(const py::tuple& limits)
       : sigma(limits[0].cast<double>()),
         gate(limits[1].cast<double>()),

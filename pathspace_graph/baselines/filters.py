@@ -8,8 +8,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from pathspace_graph.batch.association import LINE_STEP
+from pathspace_graph.factors import se2
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.se2 import compose, inverse, left_of, move_points, to_map
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
@@ -19,29 +19,19 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.tracks import FORGET_AFTER, Tracks, nearest_within
-from pathspace_graph.places.constellation import BEGINNING, Constellation, Prior, SampledCurves, beginning_of
-from pathspace_graph.places.find import find, sure
-from pathspace_graph.places.passes import tried_along
+from pathspace_graph.places import find as places
 from pathspace_graph.run import CycleResult, Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
-from pathspace_graph.spline.bspline import BSpline, sparse_rows
-from pathspace_graph.spline.knots import SAMPLED_WEIGHT, LeastSquares
+from pathspace_graph.spline.bspline import SAMPLED_WEIGHT, BSpline, LeastSquares, sparse_rows
 
-from .ckf_belief import HEAD, Belief, point_columns, transform
-from .ckf_curves import CurveState, Expansion, classify, in_map, update
-from .landmark_association import ROUGH_GATE, assign, compatible, pair_costs
-from .landmark_map import UNASSOCIATED, landmark_counts, point_map
-from .online import FRONT_END, OnlineBaseline
+from . import landmarks
+from .ckf import HEAD, Belief, CurveState, Expansion, classify, in_map, point_columns, transform, update
 
 JOIN_MARGIN: Final = 10.0  # with `BEGINNING`, largest distance of the seam from the end of a curve (m)
 JOIN_SHARE: Final = 0.5  # least parameter of the seam on a short curve, as a share of its length
 OVERLAP_STEP: Final = 1.0  # step of the points of the overlap (m)
 OVERLAP_ROOM: Final = 4.0  # search range of their foot points on the beginning, about the expected ones (m)
-CURVATURE_MAX: Final = 0.7  # limit of the curvature (1/m), so that a kink does not attract all knots
-SIGMA_SIMPLIFY: Final = 0.1  # of a control point's move by simplification, a looser prior (m)
-LINEAR_BASELINE: Final = 0.5  # share of the knots that is spread evenly; the others follow the curvature
-SEAM_MARGIN: Final = 0.5  # distance before the seam within which a cone belongs to the beginning (m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +58,12 @@ def make_periodic(
     spline, overlap = boundary.spline(control_points), find_overlap(boundary, control_points)
     period, u = overlap.period, boundary.cone_parameters
     u = np.arange(0.0, period, LINE_STEP) if settings.of_lines else u
-    u = _apart(u[u < period - SEAM_MARGIN], settings.growth.merge_radius)
-    size = max(settings.spline.min_size, int(settings.spline.size_share * len(u)))
-    breaks = curvature_weighted_breaks(spline, size, LINEAR_BASELINE, 0.0, period)
+    kept = list[float]()  # on the closed curve, each farther than the merge radius from the one before
+    for place in u[u < period - 0.5].tolist():  # half a metre before the seam the beginning has them
+        if not kept or place - kept[-1] > settings.growth.merge_radius:
+            kept.append(place)
+    size = max(settings.spline.min_size, int(settings.spline.size_share * len(kept)))
+    breaks = curvature_weighted_breaks(spline, size, 0.5, 0.0, period)  # half of the knots are even
     frame = BSpline.periodic_from(breaks, np.zeros((len(breaks) - 1, 2)), boundary.degree)
     u = np.linspace(*spline.domain, int(boundary.length / 0.1) + 1)
     fit = LeastSquares(frame, overlap.new_parameter(u), SAMPLED_WEIGHT)
@@ -87,7 +80,7 @@ def curvature_weighted_breaks(spline: BSpline, count: int, baseline: float, low:
     first, last = spline.domain
     u = np.linspace(low, high, 40 * count + 1)
     middle, even = 0.5 * (u[1:] + u[:-1]), np.hypot(*np.diff(spline.evaluate(u), axis=0).T)
-    bent = np.minimum(np.abs(spline.curvature(middle)), CURVATURE_MAX) * even
+    bent = np.minimum(np.abs(spline.curvature(middle)), 0.7) * even  # 1/m, or a kink attracts all knots
     if not spline.periodic:
         beyond = (middle < first) | (middle > last)
         bent[beyond], even[beyond] = 0.0, (u[1] - u[0]) * spline.length() / (last - first)
@@ -99,22 +92,13 @@ def curvature_weighted_breaks(spline: BSpline, count: int, baseline: float, low:
     return breaks
 
 
-def _apart(values: Array, distance: float) -> Array:
-    """Thin sorted values (k,) so that successive ones differ by more than `distance`."""
-    kept: list[float] = []
-    for value in values.tolist():
-        if not kept or value - kept[-1] > distance:
-            kept.append(value)
-    return np.array(kept)
-
-
 def find_overlap(boundary: Boundary, control_points: Array) -> Overlap:
     """Find the overlap of a curve's end with its beginning; the seam is the foot point of the beginning.
 
     A gap between end and beginning is bridged by a straight line.
     """
     confirmed_end = boundary.confirmed_end
-    late = max(confirmed_end - BEGINNING - JOIN_MARGIN, JOIN_SHARE * confirmed_end)
+    late = max(confirmed_end - places.BEGINNING - JOIN_MARGIN, JOIN_SHARE * confirmed_end)
     ends = boundary.evaluate(control_points, np.array([0.0, confirmed_end]))
     foot = boundary.find(control_points, ends[:1], np.array([late]), np.array([confirmed_end]))
     if not foot.interior[0]:
@@ -132,26 +116,30 @@ def find_overlap(boundary: Boundary, control_points: Array) -> Overlap:
 # --- the filters -----------------------------------------------------------------------------------------
 
 FILTER_REACH: Final = 9.0  # reach of a curve's end ahead of the vehicle (m along the predicted path)
-RECENT: Final = 2.0  # largest age of the detections that are laid on the early segment (s)
 SIGMA_TIE: Final = 0.15  # standard deviation of the distance between the ends of a curve at closure (m)
 SIGMA_ALONG: Final = 0.4  # standard deviation of the place on the early segment, along the curves (m)
-TIE_REACH: Final = 1.0  # largest distance of correspondences from the beginning (m)
 
 
-class _Filter(OnlineBaseline):
+class _Filter(landmarks.OnlineBaseline):
     """Belief of both filters."""
 
     def _begin(self) -> None:
-        self.belief = Belief.at_start(self.settings.odometry, self.settings.calibration)
+        # the priors of the sensor are wide: unlike a window, a filter cannot relinearize past errors
+        odometry, sensor = self.settings.odometry, self.settings.calibration
+        sigmas = np.array([*odometry.sigmas, *sensor.widened().sigmas])
+        self.belief = Belief(np.zeros(POSE), np.diag(np.square(odometry.sigmas_start)), sigmas)
+        known = self.settings.calibrations
+        self.belief.mean[POSE : POSE + len(known)] = known
 
     def vehicle_state(self) -> VehicleState:
-        return self.belief.vehicle_state()
+        mean, covariance = self.belief.mean, self.belief.covariance
+        return VehicleState.split(mean[:POSE], mean[POSE:HEAD], covariance[:HEAD, :HEAD].copy())
 
 
 class CkfMapper(_Filter):
     """Maps a track's two boundaries by a cubature Kalman filter over the pose and all control points."""
 
-    READS: ClassVar = (*FRONT_END, "ckf", "gauge")
+    READS: ClassVar = (*landmarks.FRONT_END, "ckf", "gauge")
 
     def _begin(self) -> None:
         super()._begin()
@@ -167,7 +155,7 @@ class CkfMapper(_Filter):
         self.belief.follow(reading.motion)
         detections = self.belief.corrected(reading.detections)
         state.locate_vehicle()
-        self.path.update(state.pose.copy())
+        self.path.update(state.belief.pose.copy())
         self.path.steer(reading.motion.twists)
         watch.lap("predict")
         found = classify(state, detections)
@@ -177,7 +165,7 @@ class CkfMapper(_Filter):
             free = np.ones(len(detections.labels), bool)
             for on in found.values():
                 free[on.rows] = False
-            path_ahead = self.path.ahead(state.pose, FILTER_REACH)
+            path_ahead = self.path.ahead(state.belief.pose, FILTER_REACH)
             if self.expansion.expand(state, detections, path_ahead, free):
                 found = classify(state, detections)
         watch.lap("expand")
@@ -187,17 +175,19 @@ class CkfMapper(_Filter):
         watch.lap("close")
         left, right = (state.curves[label].size if label in state.curves else 0 for label in BOUNDARIES)
         used = sum(len(on.rows) for on in found.values())
-        return CycleResult(detections.t, state.pose.copy(), (left, right), used, self.closed, watch.laps)
+        return CycleResult(
+            detections.t, state.belief.pose.copy(), (left, right), used, self.closed, watch.laps
+        )
 
     def _close(self, detections: Detections) -> None:
         """Search the early segment after the shortest lap; close and simplify both curves there."""
         settings, state = self.settings.closing, self.state
         if self.closed:
             return
-        recent = [*self._recent, (state.pose.copy(), detections)]
-        self._recent = [cycle for cycle in recent if cycle[1].t > detections.t - RECENT]
+        recent = [*self._recent, (state.belief.pose.copy(), detections)]
+        self._recent = [cycle for cycle in recent if cycle[1].t > detections.t - 2.0]  # s
         too_soon = self.path.length - self._last_check < settings.check_interval
-        if too_soon or not state.curves or not self.path.near_beginning(state.pose, settings):
+        if too_soon or not state.curves or not self.path.near_beginning(state.belief.pose, settings):
             return
         self._last_check = self.path.length
         motion = associate_early_segment(state, self._recent, self.path.beginning)
@@ -224,11 +214,11 @@ def associate_early_segment(
     splines = {label: state.spline(label) for label in state.curves}
     ends = {label: spline.domain[1] for label, spline in splines.items()}
     poses, table = np.array([pose for pose, _ in cycles]), DetectionColumns.of([seen for _, seen in cycles])
-    seen = Constellation.of(table, poses, state.settings.growth).seen_from(poses[-1])
+    seen = places.Constellation.of(table, poses, state.settings.growth).seen_from(poses[-1])
     information = np.asarray(np.linalg.inv(state.belief.covariance[:POSE, :POSE]), np.float64)
-    prior, _ = tried_along(beginning, Prior(poses[-1:], information))
-    place = sure(find(seen, SampledCurves.of(splines, ends), prior))
-    return None if place is None else compose(place.pose, inverse(poses[-1]))
+    prior, _ = places.tried_along(beginning, places.Prior(poses[-1:], information))
+    place = places.sure(places.find(seen, places.SampledCurves.of(splines, ends), prior))
+    return None if place is None else se2.compose(place.pose, se2.inverse(poses[-1]))
 
 
 def update_by_correspondences(state: CurveState, motion: Array) -> bool:
@@ -242,17 +232,17 @@ def update_by_correspondences(state: CurveState, motion: Array) -> bool:
     for label in state.curves:
         spline = state.spline(label)
         high = spline.domain[1]
-        u = np.arange(max(high - BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
+        u = np.arange(max(high - places.BEGINNING - JOIN_MARGIN, JOIN_SHARE * high), high, OVERLAP_STEP)
         zero = np.zeros(len(u))
-        moved = move_points(motion, spline.evaluate(u))
-        foot = state.foot_points(label, moved, zero, zero + beginning_of(high))
-        on = foot.interior & (np.abs(foot.distance) < TIE_REACH)
+        moved = se2.move_points(motion, spline.evaluate(u))
+        foot = state.foot_points(label, moved, zero, zero + places.beginning_of(high))
+        on = foot.interior & (np.abs(foot.distance) < 1.0)  # m
         if not on.any():
             return False
         u, w = u[on], foot.u[on]
         basis = spline.basis_matrix(u) - spline.basis_matrix(w)
         tangents = spline.tangent_unit(w)
-        normals = left_of(tangents)
+        normals = se2.left_of(tangents)
         by_axis = [(basis[:, :, None] * axis[:, None, :]).reshape(len(u), -1) for axis in (normals, tangents)]
         rows.append(np.concatenate(by_axis))
         columns.append(state.columns(label, np.arange(spline.size)))
@@ -274,7 +264,7 @@ def simplify(state: CurveState, observed: Mapping[int, Mapping[int, Array]]) -> 
         foot = boundary.find(known, cones, zero, zero + boundary.confirmed_end)
         boundary.cone_parameters = np.sort(foot.u)
         overlap, curve, change = make_periodic(boundary, known, settings)
-        state.replace(label, curve, change, SIGMA_SIMPLIFY)
+        state.replace(label, curve, change, 0.1)  # m, by which simplification moves a control point
         state.pose_u[label] = float(overlap.new_parameter(np.array([state.pose_u[label]]))[0])
 
 
@@ -288,7 +278,7 @@ class LandmarkCkf(_Filter):
     closes, so duplicates remain.
     """
 
-    READS: ClassVar = (*FRONT_END, "ckf")
+    READS: ClassVar = (*landmarks.FRONT_END, "ckf")
 
     def _begin(self) -> None:
         super()._begin()
@@ -302,17 +292,21 @@ class LandmarkCkf(_Filter):
         watch.lap("predict")
         landmark, is_new = self._associate(detections)
         watch.lap("associate")
-        self._update(detections, landmark)
+        rows = np.flatnonzero(landmark != landmarks.UNASSOCIATED)
+        if len(rows):
+            columns = self.belief.measuring_columns(point_columns(landmark[rows]))
+            noise = block_diag(*detections.covariances[rows])
+            measured = detections.points_vehicle[rows].ravel()
+            self.belief.update(columns, self.belief.measuring(landmark[rows]), measured, noise)
         watch.lap("update")
         self._create(detections, is_new)
         watch.lap("create")
-        pose, sizes = self.belief.pose.copy(), landmark_counts(self.labels)
-        used = int((landmark != UNASSOCIATED).sum())
-        return CycleResult(detections.t, pose, sizes, used, False, watch.laps)
+        pose, sizes = self.belief.pose.copy(), landmarks.landmark_counts(self.labels)
+        return CycleResult(detections.t, pose, sizes, len(rows), False, watch.laps)
 
     def _associate(self, detections: Detections) -> tuple[IntArray, BoolArray]:
-        points = to_map(detections.points_vehicle, self.belief.pose[None])
-        nearby = np.flatnonzero(nearest_within(self.belief.points, points, ROUGH_GATE)[1])
+        points = se2.to_map(detections.points_vehicle, self.belief.pose[None])
+        nearby = np.flatnonzero(nearest_within(self.belief.points, points, landmarks.ROUGH_GATE)[1])
         predicted, covariances = np.zeros((0, POINT)), np.zeros((0, POINT, POINT))
         if (k := len(nearby)) > 0:
             columns, belief = self.belief.measuring_columns(point_columns(nearby)), self.belief
@@ -320,22 +314,13 @@ class LandmarkCkf(_Filter):
             seen = transform(belief.measuring(nearby), belief.mean[columns], covariance)
             predicted = seen.mean.reshape(k, POINT)
             covariances = seen.covariance.reshape(k, POINT, k, POINT)[np.arange(k), :, np.arange(k)]
-        cost = pair_costs(detections.points_vehicle, detections.covariances, predicted, covariances)
-        cost[~compatible(detections.labels, self.labels[nearby])] = np.inf
-        column, is_new = assign(cost)
-        matched = column != UNASSOCIATED
-        landmark = np.full(len(detections.labels), UNASSOCIATED, np.intp)
+        cost = landmarks.pair_costs(detections.points_vehicle, detections.covariances, predicted, covariances)
+        cost[~landmarks.compatible(detections.labels, self.labels[nearby])] = np.inf
+        column, is_new = landmarks.assign(cost)
+        matched = column != landmarks.UNASSOCIATED
+        landmark = np.full(len(detections.labels), landmarks.UNASSOCIATED, np.intp)
         landmark[matched] = nearby[column[matched]]
         return landmark, is_new
-
-    def _update(self, detections: Detections, landmark: IntArray) -> None:
-        rows = np.flatnonzero(landmark != UNASSOCIATED)
-        if len(rows) == 0:
-            return
-        columns = self.belief.measuring_columns(point_columns(landmark[rows]))
-        noise = block_diag(*detections.covariances[rows])
-        measured = detections.points_vehicle[rows].ravel()
-        self.belief.update(columns, self.belief.measuring(landmark[rows]), measured, noise)
 
     def _create(self, detections: Detections, new: BoolArray) -> None:
         """Add a landmark for each track that has enough detections beyond the gate of every landmark."""
@@ -352,4 +337,4 @@ class LandmarkCkf(_Filter):
 
     def _map(self, with_covariance: bool) -> Map:
         joint = self.belief.covariance[HEAD:, HEAD:] if with_covariance else None
-        return point_map(self.belief.points, self.labels, joint, False)
+        return landmarks.point_map(self.belief.points, self.labels, joint, False)

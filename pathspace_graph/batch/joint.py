@@ -29,9 +29,17 @@ from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.lengths import scaled
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.places.constellation import Constellation, Prior
-from pathspace_graph.places.find import KnownRoad, find, sure
-from pathspace_graph.places.passes import STRETCH, find_return, revisit_of, seen_in
+from pathspace_graph.places.find import (
+    STRETCH,
+    Constellation,
+    KnownRoad,
+    Prior,
+    find,
+    find_return,
+    revisit_of,
+    seen_in,
+    sure,
+)
 from pathspace_graph.run import Stopwatch
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 

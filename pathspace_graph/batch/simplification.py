@@ -15,13 +15,14 @@ from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import ExactSplineSettings, MapperSettings, SplineSettings
 from pathspace_graph.spline.boundary import Boundary
-from pathspace_graph.spline.bspline import BSpline, sparse_rows
-from pathspace_graph.spline.knots import (
+from pathspace_graph.spline.bspline import (
     ENERGY_WEIGHT,
+    BSpline,
     LeastSquares,
     chosen_breaks,
     fewest_breaks,
     fit_spline,
+    sparse_rows,
 )
 
 from .association import ROW_CONES, associate, cones_of_curve, feet_of_cones, locate_poses

@@ -23,12 +23,9 @@ from pathspace_graph.lengths import scaled
 from pathspace_graph.options.data import Convert
 from pathspace_graph.plausibility.diagnosis import measured_line
 from pathspace_graph.plausibility.judge import because, hints
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.settings.mapper import LimitSettings, MapperSettings
 
-from .estimate import tell
-from .outcome import Outcome
-from .simulate import describe
+from .simulate import Outcome, describe, tell
 
 OF_KIND: Final = {  # kinds of records that take an option; any other option is for all of them
     **dict.fromkeys(("odometry", "detections"), ("bag", "csv")),

@@ -23,7 +23,6 @@ from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.eval.metrics import summary
 from pathspace_graph.eval.metrics.alignment import MapDifference, differences
-from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.graph.exchange import GRAPH_FILE, write_graph
@@ -31,7 +30,6 @@ from pathspace_graph.health import DEGRADED, LOST, counts
 from pathspace_graph.io.files import atomic_file, check_target
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map, as_ribbon, read_map
-from pathspace_graph.io.overrides import override
 from pathspace_graph.io.results import BatchRun, RunResult, write_result
 from pathspace_graph.labels import NAMES
 from pathspace_graph.lengths import scaled
@@ -40,12 +38,13 @@ from pathspace_graph.options.runs import Batch, MapKind, Online, Plot
 from pathspace_graph.plausibility.diagnosis import crossings_of, diagnose, noise_lines
 from pathspace_graph.plausibility.judge import Hint, objections, read_plausible_log
 from pathspace_graph.run import Observer, OnlineEstimator, run_online, with_own
+from pathspace_graph.settings.checked import override
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import EVENTS
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.spline.boundary import crossings_told
 
-from .outcome import Outcome
+from .simulate import Outcome, tell
 
 Run = TypeVar("Run", bound=RunResult)
 
@@ -82,7 +81,7 @@ def online_command(options: Online) -> Outcome:
     known = None if options.on is None else read_known_map(options.on, options.map_sigma, options.settings)
     drawing = viewing = None
     if options.plot is not None:  # importing matplotlib is slow
-        drawing = import_module("pathspace_graph.commands.plot")
+        drawing = import_module("pathspace_graph.commands.pictures")
         drawing.check_picture(options.plot)
     if options.view or options.save_view is not None:
         viewing = import_module("pathspace_graph.eval.view.recording")
@@ -109,7 +108,7 @@ def online_command(options: Online) -> Outcome:
         observers = [] if recorder is None else [recorder]
         mapped = map_online(log, estimator, options.estimator, observers)
         result = of_kind(with_own(mapped, parameters), options.map, options.settings)
-        summarized, changes = summarize(result, log, hints), list[MapDifference]()
+        summarized, changes = summary.summarize(result, log, hints), list[MapDifference]()
         found_at = estimator.placed_at if isinstance(estimator, FixedLagMapper) else None
         if known is not None and found_at is not None:
             before = scaled(known[0], 1.0 / result.scale)
@@ -188,7 +187,7 @@ def batch_of_several(options: Batch) -> Outcome:
     drives = dict[str, Any]()
     shown = ("lap_count", "noise", "calibration", "final", "ate", "inside_two_sigma")
     for own, drive in joint.drives.items():  # with truth in the frame of each drive
-        known = summarize(drive.moved(inverse(joint.frames[own])), logs[own])
+        known = summary.summarize(drive.moved(inverse(joint.frames[own])), logs[own])
         drives[own] = {"frame": joint.frames[own], **{key: known[key] for key in shown if key in known}}
     summarized = summarize_batch(result, logs[name], hints[name])
     summarized |= {"drives": drives, "left_out": joint.left_out}
@@ -249,20 +248,18 @@ def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
 def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
     """Summary of a run, and how its optimization began and ended."""
     start = "odometry" if isinstance(result, BatchResult) and result.online is None else "online"
-    summary = summarize(result, log, hints) | {"start": start, "converged": result.converged}
+    found = summary.summarize(result, log, hints) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
-        return summary
-    summary |= {"convergence": asdict(result.convergence), "objection": result.objection}
-    return summary | {"stages": result.seconds}
-
-
-def tell(hints: Sequence[Hint], of: str = "") -> None:
-    """Print a line for each hint on standard error, with the name of its log, if given."""
-    note(*(f"hint: {of}{'/' if of else ''}{hint.line}" for hint in hints))
+        return found
+    found |= {"convergence": asdict(result.convergence), "objection": result.objection}
+    return found | {"stages": result.seconds}
 
 
 def map_online(
-    log: Log, estimator: OnlineEstimator, name: str = DEFAULT_ONLINE, observers: Sequence[Observer] = ()
+    log: Log,
+    estimator: OnlineEstimator,
+    name: str = DEFAULT_ONLINE,
+    observers: Sequence[Observer] = (),
 ) -> RunResult:
     """Map a log with progress; the map at the end of each true lap is kept where there is truth."""
     times = summary.lap_times(log)
@@ -273,7 +270,7 @@ def map_online(
 
 def report(result: RunResult, log: Log) -> None:
     """Print the run, the paper's table where there is truth, and on standard error what was not mapped."""
-    if laps := laps_of(result, log):
+    if laps := summary.laps_of(result, log):
         table = Table()
         for name in ("lap", "rmse [m]", "missed [%]", "size"):
             table.add_column(Text(name), justify="right")  # a plain text would be markup, [m] a style
@@ -293,7 +290,7 @@ def report(result: RunResult, log: Log) -> None:
     at_one = result.at_scale_one()
     say(*noise_lines(at_one.noise))
     say(*([] if at_one.vehicle is None else diagnose(at_one.vehicle, result.settings)))
-    if missing := not_mapped(result.map, log):
+    if missing := summary.not_mapped(result.map, log):
         note("; ".join(missing))
 
 

@@ -10,7 +10,6 @@ from pathspace_graph.console import note
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.graph.exchange import GRAPH_FILE, read_graph, write_g2o
 from pathspace_graph.io import export as formats
-from pathspace_graph.io.export import LocalPlane
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import LOG_FILE, TRUTH_POSES_FILE
 from pathspace_graph.io.log_files import read_log
@@ -22,7 +21,7 @@ from pathspace_graph.plausibility.diagnosis import crossings_on
 from pathspace_graph.spline.boundary import crossings_told
 from pathspace_graph.spline.planning import LEAST_STEP, MOST_POINTS
 
-from .outcome import Outcome
+from .simulate import Outcome
 
 GRAPHS: Final = ("graph", "g2o", "dot")  # formats of a factor graph
 
@@ -37,7 +36,7 @@ def export_command(options: Export) -> Outcome:
     if options.format in ("geojson", "lanelet2") and options.origin is None:
         expected = "expected LATITUDE LONGITUDE HEADING in degrees, the heading clockwise from north"
         raise SettingsError(f"--origin: {expected}, found none, which --as {options.format} needs")
-    plane = None if options.origin is None else LocalPlane(*options.origin)
+    plane = None if options.origin is None else formats.LocalPlane(*options.origin)
     if options.format in GRAPHS:
         return export_graph(options.map / GRAPH_FILE, options.format, options.out)
     file = options.map / MAP_FILE
@@ -69,7 +68,7 @@ def export_command(options: Export) -> Outcome:
     return Outcome([options.out])
 
 
-def _write(options: Export, file: Path, track: Map, plane: LocalPlane | None) -> None:
+def _write(options: Export, file: Path, track: Map, plane: formats.LocalPlane | None) -> None:
     if options.format == "centerline":
         formats.write_centre_line(file, track, options.step)
     elif options.format == "profile":

@@ -1,10 +1,16 @@
-"""`simulate`: the log of a drive on a track from a file, or on a generated one."""
+"""`simulate`: the log of a drive on a track; and the outcome of any command, and how it tells hints."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pathspace_graph.console import progress, say
+from pathspace_graph.console import note, progress, say
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.io.files import check_target
+from pathspace_graph.io.files import check_target, to_plain
 from pathspace_graph.io.log import LOG_FILE, Log
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.options.data import Simulate
@@ -13,7 +19,32 @@ from pathspace_graph.sim.track import EVENTS, Track
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 
-from .outcome import Outcome
+if TYPE_CHECKING:
+    from pathspace_graph.plausibility.judge import Hint
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The end of a command."""
+
+    written: Sequence[Path]
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    wrong: Sequence[str] = ()  # a line each, and exit code 3; empty for a trustworthy result
+
+    def show(self, *, as_json: bool) -> None:
+        """Print the summary as JSON, or the paths of the files; objections go to standard error."""
+        files = [path for path in self.written if path.is_file() or path.is_dir()]  # no pipe or terminal
+        if as_json and (files or self.summary):
+            content = to_plain({**self.summary, "written": files, "wrong": self.wrong})
+            print(json.dumps(content, indent=2, allow_nan=False))
+        elif files:
+            say(f"written to {', '.join(map(str, files))}")
+        note(*self.wrong)
+
+
+def tell(hints: "Sequence[Hint]", of: str = "") -> None:
+    """Print a line for each hint on standard error, with the name of its log, if given."""
+    note(*(f"hint: {of}{'/' if of else ''}{hint.line}" for hint in hints))
 
 
 def simulate_command(options: Simulate) -> Outcome:

@@ -87,13 +87,13 @@ def read_bag(path: Path, options: Topics, rule: LabelRule, *, mounted: bool = Fa
         detections.t,
         Points.joined([points for _, points in detections.values]),
         source,
+        odometry.numbers,
+        f"{options.odometry}, message",
         notes,
         mounting=mounting,
         are_poses=are_poses,
         is_held=options.held,
         imu=None if imu is None else (imu.t, np.array(imu.values)),
-        rows=odometry.numbers,
-        place=f"{options.odometry}, message",
     )
 
 

@@ -77,9 +77,6 @@ class Points(NamedTuple):
         columns: Iterable[Any] = (column[chosen] for column in self)
         return Points(*columns)
 
-    def equals(self, other: "Points") -> bool:
-        return np.array_equal(self.points, other.points) and np.array_equal(self.labels, other.labels)
-
 
 def header_of(message: Any) -> Any:
     """Header of a message, of the first point of an array of markers, or None."""

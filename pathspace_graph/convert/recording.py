@@ -18,7 +18,7 @@ from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
 from pathspace_graph.io.parsing import MAX_RANGE, MAX_STAMP
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.settings.mapper import LimitSettings
 
 from .messages import ALONE, Points
 from .settings import LEAST_SPACING, Frames, NoiseSettings, Window
@@ -38,13 +38,13 @@ class Recording:
     scan_t: Array  # (M,) stamps of the messages with detections (s)
     points: Points  # detections of all messages, sensor frame
     source: dict[str, str]  # origin of the record, in words
+    rows: IntArray  # (N,) number of each row of the odometry in its file
+    place: str  # what is counted by it
     notes: Counter[str] = field(default_factory=Counter)  # what was done, in words, and how often
     mounting: tuple[float, float, float] | None = None  # sensor's pose (m, m, rad), where it is stated
     are_poses: bool = False  # whether the motion is in poses
     is_held: bool = False  # whether twists are means until the next one; else they are samples
     imu: tuple[Array, Array] | None = None  # stamps (s) and yaw rates (rad/s) (k,) of an IMU
-    rows: IntArray | None = None  # (N,) number of each row of the odometry in its file, by default from 1
-    place: str = "odometry, row"  # what is counted by it
     units: str = ""  # option that states other units, where there is one
 
     @property
@@ -52,17 +52,12 @@ class Recording:
         """Number of parts of the interval of two twists that are interpolated; 1 for none."""
         return 1 if self.are_poses or self.is_held else parts_of(self.t)
 
-    @property
-    def numbers(self) -> IntArray:
-        """Number (N,) of each row of the odometry in its file."""
-        return np.arange(len(self.t)) + 1 if self.rows is None else self.rows
-
     def chosen(self, kept: BoolArray, seen: BoolArray) -> "Recording":
         """Keep some rows (N,) of the odometry and some messages (M,) with detections."""
         points = self.points.where(seen[self.points.message])
         points = points._replace(message=(np.cumsum(seen) - 1)[points.message])
         scan_t, t, motion = self.scan_t[seen], self.t[kept], self.motion[kept]
-        return replace(self, t=t, motion=motion, rows=self.numbers[kept], scan_t=scan_t, points=points)
+        return replace(self, t=t, motion=motion, rows=self.rows[kept], scan_t=scan_t, points=points)
 
     def at(self, rows: IntArray) -> str:
         """Say where rows of the odometry are."""
@@ -122,7 +117,7 @@ def windowed(record: Recording, window: Window, file: Path) -> Recording:
     of_odometry, of_scans, notes = strays(record.t), strays(record.scan_t), record.notes
     far = "have a stamp far from those around them, and were left out"
     if of_odometry.any():
-        where = record.at(record.numbers[of_odometry])
+        where = record.at(record.rows[of_odometry])
         notes[f"odometry samples {far}: {where}"] += int(of_odometry.sum())
     notes[f"messages with detections {far}"] += int(of_scans.sum())
     record, most = record.chosen(~of_odometry, ~of_scans), window.range_max
@@ -194,7 +189,7 @@ def _odometry(record: Recording, frames: Frames, file: Path) -> Odometry:
         notes[told] += int((~good).sum())
         return rows[good]
 
-    rows = np.column_stack([record.numbers, record.t, record.motion])  # number, stamp and motion
+    rows = np.column_stack([record.rows, record.t, record.motion])  # number, stamp and motion
     if record.imu is not None:
         rows[:, 4] = 0.0  # it comes from the IMU, so that none is missing
     rows = keep(
@@ -408,7 +403,8 @@ def _cycles(
         if not logs.is_one_cycle(t[index], cycle):
             cycle = float(t[index])
         scans = found.setdefault(cycle, [])
-        if any(map(points.equals, scans)):
+        alike = [one for one in scans if np.array_equal(one.points, points.points)]
+        if any(np.array_equal(one.labels, points.labels) for one in alike):
             notes["messages with detections were repetitions, and were left out"] += 1
             continue
         told = "messages with detections are at most 1 ms after another one, and are one cycle with it"
@@ -572,17 +568,12 @@ def along_lines(points: Points, spacing: float) -> Points:
     parts = [points.where(spaced_apart(points.points, spacing, points.lines < 0))]
     for line in np.unique(points.lines[points.lines >= 0]):
         own = points.where(points.lines == line)
-        placed = resampled(own.points, spacing)
+        s = path_lengths(own.points)
+        at = np.arange(0.0, s[-1] + 1e-9 * spacing, spacing)  # the multiples of the spacing
+        placed = np.column_stack([np.interp(at, s, axis) for axis in own.points.T])
         labels = np.full(len(placed), own.labels[0])
         parts.append(Points.of(placed, labels, lines=np.full(len(placed), line)))
     return Points.joined(parts)
-
-
-def resampled(vertices: Array, spacing: float) -> Array:
-    """Points (m, 2) of a polyline (n, 2) at each multiple of the spacing (m)."""
-    s = path_lengths(vertices)
-    at = np.arange(0.0, s[-1] + 1e-9 * spacing, spacing)
-    return np.column_stack([np.interp(at, s, vertices[:, 0]), np.interp(at, s, vertices[:, 1])])
 
 
 def spaced_apart(points: Array, spacing: float, chosen: BoolArray) -> IntArray:

@@ -73,10 +73,10 @@ def read_csv(
         motion,
         *scans,
         {"odometry": odometry.name, "detections": detections.name, "units": in_words},
+        rows,
+        f"{odometry.name}, row",
         are_poses=are_poses,
         is_held=topics.held,
-        rows=rows,
-        place=f"{odometry.name}, row",
         units="--units states others, as speed=km/h yaw_rate=deg/s angle=deg",
     )
 
@@ -245,8 +245,8 @@ def read_json_lines(file: Path, topics: Topics, rule: LabelRule) -> Recording:
         np.array(scan_t),
         Points.joined(scans),
         {"file": file.name},
+        np.array([row for row, _, _ in entries], int),
+        f"{file.name}, line",
         are_poses=are_poses,
         is_held=topics.held,
-        rows=np.array([row for row, _, _ in entries], int),
-        place=f"{file.name}, line",
     )

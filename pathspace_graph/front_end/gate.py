@@ -27,7 +27,7 @@ from pathspace_graph.io.log import (
 )
 from pathspace_graph.labels import LEFT, NAMES
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.settings.mapper import LimitSettings
 
 TWIST: Final = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}  # units by component
 KNOWN_LABELS: Final = "one of " + ", ".join(f"{label} ({name})" for label, name in enumerate(NAMES))

@@ -12,7 +12,7 @@ from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.rows import OdometryChain, Rows, odometry_rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, pose_key
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
-from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
+from pathspace_graph.settings.mapper import CalibrationSettings, OdometrySettings
 
 
 @dataclass(frozen=True, eq=False)

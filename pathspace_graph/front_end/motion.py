@@ -20,7 +20,7 @@ from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
-from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
+from pathspace_graph.settings.mapper import CalibrationSettings, MotionSettings
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from pathspace_graph.mapping.path import (
     in_front_row,
 )
 from pathspace_graph.mapping.tracks import Tracks
-from pathspace_graph.settings.online import GrowthSettings, SidesSettings
+from pathspace_graph.settings.mapper import GrowthSettings, SidesSettings
 
 # --- rows of cones ---------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ import pymap3d
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.labels import BOUNDARIES, NAMES
-from pathspace_graph.settings.output import SpeedSettings
+from pathspace_graph.settings.mapper import SpeedSettings
 from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.centre_line import find_line
 from pathspace_graph.spline.planning import speed_profile

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pathspace_graph.brief import Brief, Shown
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise
@@ -19,7 +21,6 @@ from pathspace_graph.labels import NAMES, UNKNOWN, Kind, label_from_name
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
 
 from . import parsing as limits
-from .brief import Brief, Shown, pictures
 from .parsing import Column, Table
 
 if TYPE_CHECKING:
@@ -209,7 +210,7 @@ class Log(Shown):
 
     def plot(self, **options: Any) -> Figure:
         """Draw the log; the options are those of `eval.figures.map_plot.plot_log`."""
-        figure: Figure = pictures().plot_log(self, **options)
+        figure: Figure = import_module("pathspace_graph.eval.figures.map_plot").plot_log(self, **options)
         return figure
 
     @classmethod

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Self
 
@@ -12,6 +13,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from scipy.linalg import block_diag
 
+from pathspace_graph.brief import Brief, Shown
 from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import move_points, rotation
@@ -20,7 +22,6 @@ from pathspace_graph.spline.bspline import BSpline
 from pathspace_graph.spline.centre_line import find_line
 from pathspace_graph.spline.planning import CentreLine, centre_line
 
-from .brief import Brief, Shown, pictures
 from .parsing import MAX_COORDINATE, read_json, shown, typed
 
 if TYPE_CHECKING:
@@ -151,7 +152,7 @@ class Map(Shown):
 
     def plot(self, **options: Any) -> Figure:
         """Draw the map; the options are those of `eval.figures.map_plot.plot_map`."""
-        figure: Figure = pictures().plot_map(self, **options)
+        figure: Figure = import_module("pathspace_graph.eval.figures.map_plot").plot_map(self, **options)
         return figure
 
     @property

@@ -220,7 +220,7 @@ class Table:
             words = ("nan" if text.strip().lower() in MISSING else text for text in texts)
             texts = np.array([*words], dtype=object)
         try:
-            if is_plain("".join(texts)):
+            if (text := "".join(texts)).isascii() and "_" not in text:  # which Python would also read
                 return texts.astype(float)
         except ValueError:
             pass
@@ -233,14 +233,10 @@ class Table:
         return np.column_stack([self.numbers(name, largest) for name in names])
 
 
-def is_plain(text: str) -> bool:
-    """Whether numbers are in ASCII and have no underscores, which Python would also read."""
-    return text.isascii() and "_" not in text
-
-
 def is_number(text: str) -> bool:
+    """Whether a text is a number, in ASCII and without underscores."""
     try:
         float(text)
     except ValueError:
         return False
-    return is_plain(text)
+    return text.isascii() and "_" not in text

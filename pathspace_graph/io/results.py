@@ -1,25 +1,33 @@
-"""Result of a run (FORMATS): map, trajectory in the TUM format, cycles and summary in one folder."""
+"""Result of a run (FORMATS): map, trajectory in the TUM format, cycles, summary, and what made it."""
 
 from __future__ import annotations
 
+import platform
+import re
+import shutil
+import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from functools import cache
+from importlib import import_module
+from importlib.metadata import version
 from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from threadpoolctl import threadpool_info
 
+from pathspace_graph.brief import Brief, Shown
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.odometry import CALIBRATION, CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.lengths import POSE_LENGTHS, scaled
-from pathspace_graph.provenance import made
 
-from .brief import Brief, Shown, frames, notebook
 from .files import atomic_folder, write_json, write_table
 from .map import MAP_FILE, Map, map_to_json
 
@@ -28,6 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from .log import Truth
+
 
 TRAJECTORY_FILE: Final = "trajectory.tum"
 SMOOTHED_FILE: Final = "smoothed.tum"
@@ -206,12 +215,13 @@ class RunResult(Shown):
 
     def to_frame(self) -> pd.DataFrame:
         """Convert the run to a frame: a row for each cycle, as in `cycles.csv`, with its pose x, y, theta."""
-        frame: pd.DataFrame = frames().run_frame(self)
+        frame: pd.DataFrame = import_module("pathspace_graph.frames").run_frame(self)
         return frame
 
     def metrics(self, truth: Truth) -> pd.DataFrame:
         """Measure each complete lap against the truth of its log: the columns of `ablate`, by lap."""
-        frame: pd.DataFrame = notebook().metrics(self, truth)
+        metrics = import_module("pathspace_graph.eval.figures.notebook").metrics
+        frame: pd.DataFrame = metrics(self, truth)
         return frame
 
     def plot(self, **options: Any) -> Figure:
@@ -269,3 +279,42 @@ def _write_drive(folder: Path, result: RunResult) -> None:
         write_trajectory(folder / SMOOTHED_FILE, result.trajectory_t, result.smoothed)
     columns = [[getattr(record, name) for record in result.cycles] for name in CYCLE_COLUMNS]
     write_table(folder / CYCLES_FILE, CYCLE_COLUMNS, *columns)
+
+
+# --- where, when and by which commit a result was made --------------------------------------------------
+
+
+def made() -> dict[str, str]:
+    """Commit, or version outside a repository, machine and date of what this package makes now."""
+    folder, named = Path(__file__).parents[1], machine()
+    installed = {"site-packages", "dist-packages"} & {*folder.parts}  # a repository around it is another one
+    commit = "" if installed else commit_of(folder)
+    parts = (named["host"], named["processor"], named["blas"])
+    commit = commit or f"version {version('pathspace-graph')}"
+    return {"commit": commit, "machine": ", ".join(filter(None, parts)), "date": now()}
+
+
+def now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+@cache
+def machine() -> dict[str, str]:
+    """Host, processor, and the kernels that BLAS has chosen for it."""
+    file, blas = Path("/proc/cpuinfo"), {pool.get("architecture") for pool in threadpool_info()}
+    model = re.search(r"model name\s*: (.*)", file.read_text()) if file.exists() else None
+    processor = model[1] if model else platform.processor() or platform.machine()
+    return {"host": platform.node(), "processor": processor, "blas": " ".join(sorted(filter(None, blas)))}
+
+
+@cache
+def commit_of(folder: Path | None) -> str:
+    """Short hash of the commit that is checked out, with `+` where something differs from it.
+
+    It is empty where there is none.
+    """
+    git = shutil.which("git")
+    if git is None or folder is None:
+        return ""
+    command = [git, "-C", str(folder), "describe", "--always", "--dirty=+", "--exclude=*"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()

@@ -28,7 +28,7 @@ from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.motion import MeasuredMotion, inflate_priors
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.mapping.state import GivenFactor
-from pathspace_graph.places.passes import SeenIn
+from pathspace_graph.places.find import SeenIn
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .closing import take_known, take_marginal

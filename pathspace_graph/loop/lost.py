@@ -20,9 +20,7 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.mapping.smoother import CurveSmoother
-from pathspace_graph.places.constellation import Prior
-from pathspace_graph.places.find import KnownRoad, Place, sure
-from pathspace_graph.places.passes import STRETCH, place_on
+from pathspace_graph.places.find import STRETCH, KnownRoad, Place, Prior, place_on, sure
 
 from .drive import Drive, Phase, Step
 

@@ -16,10 +16,11 @@ from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.mapping.path import HEADING
 from pathspace_graph.mapping.road import Road
-from pathspace_graph.places.constellation import Prior, SampledCurves
-from pathspace_graph.places.passes import (
+from pathspace_graph.places.find import (
     NEARBY,
     NEWEST_PATHS,
+    Prior,
+    SampledCurves,
     newest_place,
     return_to_beginning,
     revisit_of,

@@ -16,7 +16,7 @@ from pathspace_graph.mapping.path import SIDES, Candidates, End, PathAhead, chai
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tracks import FORGET_AFTER, KNOWN_SIGMA, Tracks, nearest_within
-from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.settings.mapper import GrowthSettings
 from pathspace_graph.spline.boundary import Boundary, open_boundary
 
 GROWTH_REACH: Final = 7.0  # farthest ahead of the vehicle that a boundary is extended (m along the path)

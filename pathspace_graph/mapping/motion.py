@@ -15,8 +15,7 @@ from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, pose_ke
 from pathspace_graph.graph.window import MapRows, SmootherSettings
 from pathspace_graph.io.log import SIGMA_ODOMETRY, Odometry
 from pathspace_graph.io.results import VehicleState
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import OdometrySettings
+from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
 
 from .path import DrivenPath
 

@@ -20,7 +20,7 @@ from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.labels import POINTS
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.tracks import KNOWN_SIGMA, linked
-from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.settings.mapper import GrowthSettings
 
 VAGUE: Final = 0.6  # standard deviation of a detection from which on it tells no number of cones (m)
 TOGETHER: Final = 0.4  # least share of a place's cycles that detect all its cones: four, with 0.8 each

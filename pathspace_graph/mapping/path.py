@@ -10,7 +10,7 @@ from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import move_points
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.settings.online import ClosingSettings
+from pathspace_graph.settings.mapper import ClosingSettings
 
 STEP: Final = 0.3  # least distance of neighbouring positions of the stored path (m)
 PATH_MEMORY: Final = 60.0  # length of the stored path behind the vehicle, and of the stored first stretch (m)

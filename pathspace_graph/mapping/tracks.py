@@ -12,7 +12,7 @@ from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import move_points, rotated
 from pathspace_graph.labels import LEFT, NAMES, RIGHT
-from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.settings.mapper import GrowthSettings
 
 MERGE_SIGMAS: Final = 2.5  # gate of a smeared detection about a track, in sigmas of both together
 MERGE_MOST: Final = 2.0  # largest such gate, in merge radii: the next cone of the row is farther away

@@ -103,7 +103,7 @@ class FixedLagMapper(MapperEstimate):
     ) -> CycleResult:
         """Process one perception cycle: the twists since the last cycle, and its detections.
 
-        An unusable cycle (`front_end.gate`, `settings.online`) raises a ReadingError and changes nothing.
+        An unusable cycle (`front_end.gate`, `settings.mapper`) raises a ReadingError and changes nothing.
         Impossible detections are dropped and counted. Each twist is held until the next one; twists that end
         before the newest cycle are left out.
 

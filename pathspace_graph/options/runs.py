@@ -8,10 +8,9 @@ from typing import Annotated, Any, Final, Literal
 
 from cyclopts import Group, Parameter
 
-from pathspace_graph.settings.checked import Checked
-from pathspace_graph.settings.evaluation import ScalingSettings
-from pathspace_graph.settings.mapper import BATCH_NAMES, ONLINE_NAMES, MapperSettings, Start
-from pathspace_graph.settings.output import SpeedSettings
+from pathspace_graph.errors import InputError, SettingsError
+from pathspace_graph.settings import mapper
+from pathspace_graph.settings.checked import Checked, apart, flatten, override
 
 INLINE: Final = Parameter(name="*")
 """Settings whose options have no prefix."""
@@ -62,10 +61,12 @@ class Estimation(Command):
     file: Annotated[Path | None, Parameter(name="--settings"), _SETTINGS] = None
     """TOML file of settings, or the summary.json of a run; options on the command line override it. A section
     with the name of the estimator has parameters of its own."""
-    settings: Annotated[MapperSettings, INLINE, _SETTINGS] = field(default_factory=MapperSettings)
+    settings: Annotated[mapper.MapperSettings, INLINE, _SETTINGS] = field(
+        default_factory=mapper.MapperSettings
+    )
 
     @classmethod
-    def base(cls, given: Mapping[str, Sequence[str]]) -> MapperSettings | None:
+    def base(cls, given: Mapping[str, Sequence[str]]) -> mapper.MapperSettings | None:
         """Settings of the file, if any, which the command line overrides."""
         names = given.get("estimators", given.get("estimator", ()))
         return _read_settings(Path(given["file"][0]), names)[0] if "file" in given else None
@@ -75,11 +76,23 @@ class Estimation(Command):
         return {} if self.file is None else _read_settings(self.file, estimators)[1]
 
 
-def _read_settings(file: Path, estimators: Iterable[str]) -> tuple[MapperSettings, dict[str, Any]]:
-    overrides = import_module("pathspace_graph.io.overrides")  # the help need not wait for NumPy
-    found: tuple[MapperSettings, dict[str, Any]]
-    found = overrides.read_settings(file, MapperSettings(), estimators)
-    return found
+def _read_settings(file: Path, estimators: Iterable[str]) -> tuple[mapper.MapperSettings, dict[str, Any]]:
+    """Settings with those of a file, and the own parameters of some estimators that it has.
+
+    The file is TOML or a run's `summary.json`. An InputError says what is wrong with the settings.
+    """
+    parsing = import_module("pathspace_graph.io.parsing")  # the help need not wait for NumPy
+    text = parsing.read_text(file, "a file of settings", parsing.MAX_HEADER_BYTES)
+    content = (parsing.parse_json if file.suffix == ".json" else parsing.parse_toml)(text, file)
+    table = content.get("settings", content) if isinstance(content, dict) else content
+    if not isinstance(table, dict):
+        raise InputError(file, f"expected a table of settings, found {parsing.shown(table)}")
+    defaults = mapper.MapperSettings()
+    try:
+        overrides, own = apart(flatten(table), estimators, defaults)
+        return override(defaults, overrides, ""), own
+    except SettingsError as error:
+        raise InputError(file, str(error)) from error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +115,7 @@ class Online(Checked, Estimation, FolderCommand, group=""):
     """Folder of the log."""
     out: Path
     """Folder for the map."""
-    estimator: Annotated[str, suggest(*ONLINE_NAMES)] = ONLINE_NAMES[0]
+    estimator: Annotated[str, suggest(*mapper.ONLINE_NAMES)] = mapper.ONLINE_NAMES[0]
     """Name of the online estimator."""
     scale: float | None = None
     """Size of the scene by that of a Formula Student track, such as 0.1 for a model car of 1:10 and 3 for a
@@ -137,13 +150,13 @@ class Batch(Checked, Estimation, FolderCommand, group=""):
     """Folder of the log, or folders of several drives of one track."""
     out: Path
     """Folder for the map."""
-    estimator: Annotated[str, suggest(*BATCH_NAMES)] = BATCH_NAMES[0]
+    estimator: Annotated[str, suggest(*mapper.BATCH_NAMES)] = mapper.BATCH_NAMES[0]
     """Name of the batch estimator."""
     scale: float | None = None
     """Size of the scene by that of a Formula Student track; by default that of the log."""
     map: MapKind = "boundaries"
     """Kind of map: two boundaries, or one centre line with a width."""
-    start: Start | None = None
+    start: mapper.Start | None = None
     """Where the optimization begins; by default that of `batch.start`."""
     graph: bool = False
     """Also write the optimized factor graph of a log (`graph.json`, 10 MB a lap), which `export` reads."""
@@ -201,7 +214,7 @@ class Export(Command):
     """Latitude and longitude of the map's origin (degrees, WGS84), and heading of its x axis, the direction
     of the vehicle at the start (degrees, clockwise from north). `geojson` and `lanelet2` need
     them."""
-    speed: SpeedSettings = field(default_factory=SpeedSettings)
+    speed: mapper.SpeedSettings = field(default_factory=mapper.SpeedSettings)
     """Vehicle of a `profile`."""
     start_speed: float | None = None
     """Speed at which the `profile` of an open track begins (m/s), by default what its curvature allows."""
@@ -211,7 +224,7 @@ class Export(Command):
 
 # --- many runs, and their statistics ---------------------------------------------------------------------
 
-EVERY = (*ONLINE_NAMES, *BATCH_NAMES)
+EVERY = (*mapper.ONLINE_NAMES, *mapper.BATCH_NAMES)
 STUDIES = tuple(sorted(file.stem for file in (Path(__file__).parents[1] / "eval" / "studies").glob("*.toml")))
 
 
@@ -280,7 +293,7 @@ class FaultSuite(StudyCommand):
     with the same seed.
     """
 
-    estimator: Annotated[str, suggest(*EVERY)] = ONLINE_NAMES[0]
+    estimator: Annotated[str, suggest(*EVERY)] = mapper.ONLINE_NAMES[0]
     """Name of the estimator, an online or a batch one."""
     only: tuple[str, ...] = ()
     """Names of the faults to run, as in the table."""
@@ -300,12 +313,12 @@ class Scale(Estimation, FolderCommand):
 
     out: Path
     """Folder for points, slopes and figures."""
-    estimators: Annotated[tuple[str, ...], suggest(*ONLINE_NAMES)] = ()
+    estimators: Annotated[tuple[str, ...], suggest(*mapper.ONLINE_NAMES)] = ()
     """Names of the online estimators; by default all."""
     quick: bool = False
     """Take less than a minute, with small maps and few laps, to see that everything works. It excludes all
     other `scaling` options."""
-    scaling: ScalingSettings = field(default_factory=ScalingSettings)
+    scaling: mapper.ScalingSettings = field(default_factory=mapper.ScalingSettings)
     """What is measured."""
 
 

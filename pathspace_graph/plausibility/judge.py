@@ -37,7 +37,7 @@ from pathspace_graph.io.log_files import read_log
 from pathspace_graph.io.parsing import shown
 from pathspace_graph.io.tables import read_table
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT, UNKNOWN
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.settings.mapper import LimitSettings
 
 from .regression import Better, Complex, Fit, Regression, far_better, motions_of
 

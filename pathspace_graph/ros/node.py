@@ -19,16 +19,7 @@ from typing import Any, Final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.convert import messages
-from pathspace_graph.convert.recording import (
-    ASSUMED,
-    along_lines,
-    beyond_limits,
-    default_spacing,
-    distinct,
-    in_vehicle_frame,
-    usable,
-)
+from pathspace_graph.convert import messages, recording
 from pathspace_graph.convert.settings import Frames, LabelRule, NoiseSettings
 from pathspace_graph.errors import PathspaceError, SettingsError
 from pathspace_graph.factors.arrays import Array
@@ -45,10 +36,7 @@ STEP: Final = 1.0  # distance of the published points of a boundary (m)
 AHEAD: Final = 20.0  # distance up to which the road ahead is published (m)
 CENTRE: Final = 2  # identifier of the centre line among the lines
 COLOURS: Final = {LEFT: (0.0, 0.2, 1.0), RIGHT: (1.0, 0.9, 0.0), CENTRE: (1.0, 1.0, 1.0)}  # red, green, blue
-LINE_STRIP: Final = 4  # type of a `Marker` that is a line
 MOST_POSES: Final = 1000  # number of poses of the published path, by default
-BODY: Final = "base_link"  # frame of a vehicle whose odometry names none
-TRANSFORMS: Final = "/tf"
 
 
 class MessageStream:
@@ -75,7 +63,7 @@ class MessageStream:
             twist = twist * self.frames.flip
             if not np.isfinite([t, *twist]).all() or (self.twists and t <= self.twists[-1][0]):
                 raise ValueError("odometry: expected finite numbers and a stamp later than the one before")
-            if beyond_limits(twist).any():  # an estimator would refuse each cycle that holds it
+            if recording.beyond_limits(twist).any():  # an estimator would refuse each cycle that holds it
                 raise ValueError("odometry: expected a speed and a yaw rate that a vehicle can have")
             self.twists.append((t, twist.tolist()))
             self._first = min(self._first, t)
@@ -90,14 +78,14 @@ class MessageStream:
             points = messages.points_of(message, self.rule)
             points = points.where(points.lines < 0)  # polylines beside cones are decoration
             if (points.lines == messages.DENSE).any():
-                points = usable(points, self.refused)
-                points = along_lines(points, default_spacing(points))
+                points = recording.usable(points, self.refused)
+                points = recording.along_lines(points, recording.default_spacing(points))
             else:
-                points = distinct(points, self.refused)
+                points = recording.distinct(points, self.refused)
             t = messages.stamp_of(message) or received
             if not self._first <= t < np.inf:
                 raise ValueError("detections: expected a stamp not before that of the first odometry")
-            cycle = in_vehicle_frame(t, points, self.frames, self.noise, self.refused)
+            cycle = recording.in_vehicle_frame(t, points, self.frames, self.noise, self.refused)
         except messages.BROKEN as error:
             self.refused[str(error)] += 1
             return
@@ -135,7 +123,7 @@ class Bridge:
         x, y, yaw = map(float, mounting)
         self.stream = MessageStream(Frames((x, y, yaw)), wait)
         self.mapper: FixedLagMapper | None = None  # until the first cycle, which says which noise is stated
-        self.frame, self.body = "", BODY  # frames of the odometry's pose and of the vehicle
+        self.frame, self.body = "", "base_link"  # frames of the odometry's pose and of the vehicle
         self._known = read_map(known) if known else None
         self._sigma = np.array(sigma, float)
         self._odometry = deque[tuple[float, Array, Array]](maxlen=500)  # stamp, pose and twist
@@ -167,7 +155,9 @@ class Bridge:
     def _begun(self) -> FixedLagMapper:
         stated = bool(len(self._sigma))
         sigma = self._sigma if stated else np.array(SIGMA_ODOMETRY)
-        noise = KnownNoise(sigma, odometry_stated=stated, detections_stated=not self.stream.refused[ASSUMED])
+        noise = KnownNoise(
+            sigma, odometry_stated=stated, detections_stated=not self.stream.refused[recording.ASSUMED]
+        )
         if self._known is None:
             return FixedLagMapper(odometry_sigma=noise)
         return FixedLagMapper.on(self._known, odometry_sigma=noise)
@@ -213,16 +203,6 @@ def curve_points(track: Map) -> dict[int, Array]:
     return points
 
 
-def fill_line(marker: Any, points: Array, label: int, make_point: Any) -> Any:
-    """Fill a `Marker` with a line through points (n, 2)."""
-    marker.ns, marker.id, marker.type = "track", label, LINE_STRIP
-    marker.scale.x, marker.pose.orientation.w = 0.1, 1.0
-    colour = marker.color
-    (colour.r, colour.g, colour.b), colour.a = COLOURS[label], 1.0
-    marker.points = [make_point(x=x, y=y, z=0.0) for x, y in points.tolist()]
-    return marker
-
-
 def fill_pose(position: Any, orientation: Any, pose: Array) -> None:
     """Fill the position and the quaternion of a message with a pose (3,)."""
     position.x, position.y = pose[:2].tolist()
@@ -245,11 +225,17 @@ def publisher(
 
     to_map, to_ahead = (node.create_publisher(MarkerArray, f"~/{name}", 1) for name in ("map", "ahead"))
     to_path = node.create_publisher(PathMessage, "~/path", 1)
-    to_tf = node.create_publisher(TFMessage, TRANSFORMS, 100) if tf else None
+    to_tf = node.create_publisher(TFMessage, "/tf", 100) if tf else None
     poses = deque[Any](maxlen=max(most, 1))
 
     def lines(points: dict[int, Array], header: Any) -> Any:
-        markers = [fill_line(Marker(header=header), points[label], label, Point) for label in points]
+        markers = []
+        for label, own in points.items():
+            marker = Marker(header=header, ns="track", id=label, type=Marker.LINE_STRIP)
+            marker.scale.x, marker.pose.orientation.w = 0.1, 1.0
+            (marker.color.r, marker.color.g, marker.color.b), marker.color.a = COLOURS[label], 1.0
+            marker.points = [Point(x=x, y=y, z=0.0) for x, y in own.tolist()]
+            markers.append(marker)
         return MarkerArray(markers=markers)
 
     def publish(result: CycleResult) -> None:

@@ -1,16 +1,18 @@
-"""Settings whose values msgspec checks where they are made."""
+"""Settings whose values msgspec checks where they are made, and overrides by dotted fields."""
 
-from dataclasses import MISSING, fields, is_dataclass
+import typing
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, asdict, fields, is_dataclass, replace
 from functools import cache
-from importlib import import_module
 from sys import float_info
 from types import NoneType, UnionType
-from typing import Annotated, Any, ClassVar, Final, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
 
-from pathspace_graph.errors import SettingsError, check_type
+from pathspace_graph.brief import notebook_html
+from pathspace_graph.errors import SettingsError, check_name, check_type
 
 LARGEST: Final = float_info.max  # largest finite number
 Positive = Annotated[float, Meta(gt=0.0, le=LARGEST, description="a positive number")]
@@ -42,9 +44,7 @@ class Checked:
                 changed.append(f"{entry.name}={value!r}")
         return f"{type(self).__name__}({', '.join(changed)})"
 
-    def _repr_html_(self) -> str | None:
-        found: str | None = import_module("pathspace_graph.io.brief").notebook_html(self)
-        return found
+    _repr_html_ = notebook_html
 
     def __post_init__(self) -> None:
         """Raise a SettingsError that names the first wrong setting, as the command line knows it."""
@@ -69,22 +69,73 @@ def as_setting(value: Any, settings: type[Any], name: str, where: str) -> Any:
 def _types(settings: type[Any]) -> dict[str, Any]:
     """Type of each setting, with the default limits of the numbers where it is `Checked`."""
     limits = {float: Positive, int: Count} if issubclass(settings, Checked) else {}
-    types, hints = {}, get_type_hints(settings, include_extras=True)
+    types, hints = {}, typing.get_type_hints(settings, include_extras=True)
     for entry in fields(settings):
         hint = hints[entry.name]
-        parts = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-        types[entry.name] = Union[tuple(limits.get(part, part) for part in parts)]  # noqa: UP007
+        parts = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, UnionType) else (hint,)
+        types[entry.name] = typing.Union[tuple(limits.get(part, part) for part in parts)]  # noqa: UP007
     return types
 
 
 def _in_words(kind: Any) -> str:
-    parts = get_args(kind)
-    if get_origin(kind) is Literal:
+    parts = typing.get_args(kind)
+    if typing.get_origin(kind) is Literal:
         return " or ".join(map(repr, parts))
-    if get_origin(kind) is tuple:
+    if typing.get_origin(kind) is tuple:
         return f"a list of {'' if parts[-1] is ... else f'{len(parts)} '}values, each {_in_words(parts[0])}"
-    if get_origin(kind) is Annotated:
+    if typing.get_origin(kind) is Annotated:
         described = (part.description for part in parts if isinstance(part, Meta))
         return next(described, None) or _in_words(parts[0])
     words = " or ".join(_in_words(part) for part in parts if part is not NoneType)
     return words or WORDS.get(kind) or f"a {getattr(kind, '__name__', kind)}"
+
+
+# --- overrides -------------------------------------------------------------------------------------------
+
+T = TypeVar("T")
+Overrides = Mapping[str, Any]  # new values by dotted field
+
+
+def leaves(settings: Any) -> dict[str, Any]:
+    """Value of every dotted field of a settings dataclass, in order."""
+    return flatten(asdict(settings))
+
+
+def flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Flatten nested tables to dotted names, which mean the same as TOML's dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        name = f"{prefix}{key}"
+        flat |= flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return flat
+
+
+def override(settings: T, overrides: Overrides, where: str) -> T:
+    """Override some dotted fields of settings; a wrong field or value is a SettingsError."""
+    known, before = leaves(settings), f"{where}." if where else ""
+    for name, value in overrides.items():
+        if name not in known:
+            check_name(name, known, f"{where}: expected a known setting" if where else "expected a setting")
+        settings = _set(settings, name.split("."), value, f"{before}{name}")
+    return settings
+
+
+def apart(
+    overrides: Overrides, estimators: Iterable[str], settings: Any
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Overrides of settings, and those of estimators' own parameters, `NAME.field`."""
+    known, names = leaves(settings), set(estimators)
+    own = {k: v for k, v in overrides.items() if k not in known and k.partition(".")[0] in names}
+    return {k: v for k, v in overrides.items() if k not in own}, own
+
+
+def _set(settings: Any, path: list[str], value: Any, where: str) -> Any:
+    name, *rest = path
+    if rest:
+        new = _set(getattr(settings, name), rest, value, where)
+    else:  # JSON has infinity as a text
+        new = as_setting(float(value) if value in ("inf", "-inf") else value, type(settings), name, where)
+    try:
+        return replace(settings, **{name: new})
+    except SettingsError as error:
+        raise error if str(error).startswith(where) else SettingsError(f"{where}: {error}") from error

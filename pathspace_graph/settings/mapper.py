@@ -1,21 +1,14 @@
-"""Settings of the estimators; a number that nobody changes is a constant, here or beside its use."""
+"""Settings of the estimators, their evaluation and their output; what nobody changes is a constant."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from math import inf
 from typing import ClassVar, Final, Literal, Self
 
-from pathspace_graph.errors import check_type
+from pathspace_graph.errors import SettingsError, check_type
 from pathspace_graph.labels import Kind
 
-from .checked import Checked, Unlimited
-from .online import (
-    CalibrationSettings,
-    ClosingSettings,
-    GrowthSettings,
-    LimitSettings,
-    MotionSettings,
-    OdometrySettings,
-    SidesSettings,
-)
+from .checked import Checked, Signed, Unlimited
 
 ONLINE_NAMES: Final = ("fixed-lag", "landmark-fixed-lag", "ckf", "landmark-ckf")
 """Names of our own online estimators, the default one first."""
@@ -102,6 +95,188 @@ class RelinearizeSettings(Checked):
     """Largest move of a control point or of a pose's position without a new linearization, m."""
     heading: float = 0.02
     """Largest turn of a pose without one, rad."""
+
+
+# --- settings of the online mapper: growth of open ends, closing, the front end, and constant errors ----
+
+
+@dataclass(frozen=True)
+class GrowthSettings(Checked):
+    """How the open end of a curve grows, and what a tentative track is."""
+
+    sightings: int = 3
+    """Detections within `merge_radius` that confirm a tentative track."""
+    merge_radius: float = 1.0
+    """Distance within which detections of one label belong to one tentative track (m)."""
+
+    max_unseen: ClassVar[float] = 500.0  # longest stretch of an open curve without any cone, m
+    threshold: ClassVar[float] = 0.7  # m from a curve's end below which a tentative track does not extend it
+    max_lateral: ClassVar[float] = 10.0  # m from the path at which tracks begin a boundary: half a wide road
+
+
+@dataclass(frozen=True)
+class ClosingSettings(Checked):
+    """When the loop may close."""
+
+    gauge_laps: Unlimited = 4.0
+    """Laps on the closed map after which its position and heading as a whole are fixed; `inf` for never."""
+
+    min_path: ClassVar[float] = 60.0  # least length of a lap, m
+    check_interval: ClassVar[float] = 2.0  # m along the path, from one attempt to close the loop to the next
+    radius: ClassVar[float] = 8.0  # m from the first stretch of the drive, within which the loop may close
+    drift: ClassVar[float] = 0.03  # growth of `radius` with the path driven (m/m)
+    iterations: ClassVar[int] = 2  # Gauss-Newton steps after the loop is found, and after simplification
+
+    def radius_after(self, length: float) -> float:
+        """Distance from the first stretch within which the loop may close after a length (m)."""
+        return self.radius + self.drift * length
+
+
+@dataclass(frozen=True)
+class LimitSettings(Checked, group="limits"):
+    """What a vehicle and its sensors can do at most.
+
+    A cycle beyond that is refused; a single detection beyond the range is dropped instead.
+    """
+
+    speed: float = 100.0
+    """Largest speed ahead or to a side, m/s."""
+    yaw_rate: float = 10.0
+    """Largest yaw rate, rad/s."""
+    silence: Unlimited = 30.0
+    """Longest time without a twist or a cycle, s. After a longer one a cycle is refused, and the next that
+    agrees with it is used."""
+    range_max: float = 300.0
+    """Largest distance of a detection from the vehicle, m."""
+
+
+@dataclass(frozen=True)
+class MotionSettings(Checked):
+    """The check of the odometry against the detections; where they contradict it, their motion is used."""
+
+    doubt: Unlimited = 5.0
+    """Contradiction from which the odometry is distrusted, standard deviations; `inf` to trust it always."""
+
+    accelerations: ClassVar = (5.0, 5.0, 1.5)
+    """Growth of the twist's uncertainty where one is held for longer than usual (m/s^2, m/s^2, rad/s^2)."""
+
+
+@dataclass(frozen=True)
+class SidesSettings(Checked):
+    """How the side of a cone is found from the driven path."""
+
+    colourless: float = 0.7
+    """Share of detections without a colour from which rows of cones give the sides; 1 for never."""
+
+
+# --- priors of constant errors, which become wide where a drive contradicts them -------------------------
+
+WIDE_ODOMETRY: Final = 10.0  # standard deviations of the odometry's wide priors by those of a calibrated one
+HELD: Final = 0.02  # standard deviation of a fixed scale, by its own
+
+
+class _Priors(Checked):
+    """Priors of constant errors: a known value and a standard deviation of each."""
+
+    ERRORS: ClassVar[tuple[str, ...]]  # names of the errors in order
+    sensor = True  # whether the errors are estimated
+
+    @property
+    def means(self) -> tuple[float, ...]:
+        """Known errors, (2,) of odometry or (5,) in the order of `factors.sensor:SENSOR`, or none."""
+        return tuple(getattr(self, name) for name in self.ERRORS if self.sensor)
+
+    @property
+    def sigmas(self) -> tuple[float, ...]:
+        """Standard deviations in the same order, or none."""
+        return tuple(getattr(self, f"sigma_{name}") for name in self.ERRORS if self.sensor)
+
+    def about(self, errors: Iterable[float]) -> Self:
+        """Replace the means: errors in the order of `means`, or none."""
+        return replace(self, **dict(zip(self.ERRORS, errors, strict=False)))  # type: ignore[type-var]
+
+
+@dataclass(frozen=True)
+class OdometrySettings(_Priors):
+    """Priors of the odometry's constant errors."""
+
+    ERRORS = ("scale", "bias")
+
+    sigmas_start: ClassVar = (1e-4, 1e-4, 1e-5)
+    """Standard deviations (m, m, rad) of the first pose: zero by definition, but that has no information."""
+
+    scale: Signed = 0.0
+    """Known scale error of the speeds (-): mean of its prior."""
+    bias: Signed = 0.0
+    """Known bias of the yaw rate, rad/s."""
+    sigma_scale: float = 0.005
+    """Standard deviation of the scale error (-)."""
+    sigma_bias: float = 0.002
+    """Standard deviation of the bias, rad/s."""
+    doubt: Unlimited = 4.0
+    """Contradiction from which both priors become wide, standard deviations; `inf` for never."""
+    hold_scale: bool = False
+    """Whether the scale is fixed, since the speeds set the size of the map: a free one would shrink it to
+    reduce its residuals. Its standard deviation is that of the size, in every covariance."""
+
+    @property
+    def sigmas(self) -> tuple[float, ...]:
+        """Standard deviations of the priors; a fixed scale is nearly known."""
+        return self.sigma_scale * (HELD if self.hold_scale else 1.0), self.sigma_bias
+
+    @property
+    def sigma_size(self) -> float:
+        """Standard deviation of the size of the world, where it is no variable (-)."""
+        return self.sigma_scale if self.hold_scale else 0.0
+
+    def widened(self) -> Self:
+        """Widen the priors, which are not doubted again."""
+        scale = self.sigma_scale if self.hold_scale else WIDE_ODOMETRY * self.sigma_scale
+        return replace(self, doubt=inf, sigma_scale=scale, sigma_bias=WIDE_ODOMETRY * self.sigma_bias)
+
+
+@dataclass(frozen=True)
+class CalibrationSettings(_Priors):
+    """Priors of the sensor's mounting, stamps and ranges."""
+
+    ERRORS = ("yaw", "lateral", "latency", "range_scale", "range_bias")
+
+    sensor: bool = True
+    """Whether the sensor's constant errors are estimated along with the map."""
+    sigma_yaw: float = 0.001
+    """Standard deviation of the yaw, rad."""
+    sigma_lateral: float = 0.005
+    """Standard deviation of the lateral offset, m."""
+    sigma_latency: float = 0.001
+    """Standard deviation of the latency, s."""
+    sigma_range_scale: float = 0.0005
+    """Standard deviation of the scale error of the ranges (-)."""
+    sigma_range_bias: float = 0.005
+    """Standard deviation of the bias of the ranges, m."""
+    yaw: Signed = 0.0
+    """Known yaw of the sensor, positive to the left, rad: mean of its prior."""
+    lateral: Signed = 0.0
+    """Known lateral offset of the sensor, positive to the left, m."""
+    latency: Signed = 0.0
+    """Known age of detections at their stamps, s; negative where they are newer."""
+    range_scale: Signed = 0.0
+    """Known scale error of the ranges (-)."""
+    range_bias: Signed = 0.0
+    """Known bias of the ranges, m."""
+    trust: Literal["odometry", "ranges"] | None = None
+    """Which of the two sets the size of the map where ranges and speeds disagree: only their ratio can be
+    seen. By default the odometry, unless ranges scatter by less than its scale is known."""
+    doubt: Unlimited = 4.0
+    """Contradiction from which the priors become wide, standard deviations; `inf` for never."""
+
+    def widened(self) -> Self:
+        """Widen the priors, which are not doubted again.
+
+        Their standard deviations are 20 times those of a calibrated sensor. The scale of the ranges keeps its
+        own, or the size of the map would rest on the wheels alone.
+        """
+        names = (f"sigma_{name}" for name in self.ERRORS if name != "range_scale")
+        return replace(self, doubt=inf, **{name: 20.0 * getattr(self, name) for name in names})
 
 
 # --- the batch, and the estimators to compare with ---------------------------------------------------------
@@ -212,3 +387,57 @@ def known_settings(settings: MapperSettings | None) -> MapperSettings:
     settings = MapperSettings() if settings is None else settings
     check_type("settings", settings, MapperSettings)
     return settings
+
+
+# --- settings of a speed profile ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SpeedSettings(Checked):
+    """How fast a vehicle may be on its tyres; the defaults are those of a careful Formula Student car."""
+
+    lateral: float = 10.0
+    """Largest lateral acceleration, m/s^2: the friction coefficient times gravity."""
+    forward: float = 5.0
+    """Largest acceleration on a straight, m/s^2."""
+    braking: float = 8.0
+    """Largest deceleration on a straight, m/s^2."""
+    top: Unlimited = 30.0
+    """Largest speed, m/s."""
+
+
+# --- settings of the evaluation: extent of the timing ---------------------------------------------------
+
+CONES_MIN: Final = 50.0  # number of cones seen at which the sweep over cones begins
+
+
+@dataclass(frozen=True)
+class ScalingSettings(Checked):
+    """Extent of the timing."""
+
+    cones_max: float = 2000.0
+    """Number of cones seen at which the sweep over cones ends, which begins at 50."""
+    bins: int = 16
+    """Number of points of the sweep over cones, evenly spaced on a logarithmic axis."""
+    fit_from: float = 200.0
+    """Number of cones from which on the slope against cones is fitted."""
+    readings: tuple[int, ...] = (2, 4, 8, 14, 20, 28, 40)
+    """Numbers of detections of the updates that are timed."""
+    readings_cones: int = 300
+    """Number of cones of the dense road, where these updates are timed."""
+    warm_up: int = 30
+    """Cycles at the beginning of the dense road that are not counted."""
+    laps: int = 20
+    """Laps of the closed road."""
+    laps_cones: int = 100
+    """Cones of the closed road."""
+    budget: float = 0.5
+    """Mean update at which an estimator is stopped (s)."""
+
+    def __post_init__(self) -> None:
+        """Raise SettingsError as well where a range is empty."""
+        super().__post_init__()
+        if self.cones_max <= CONES_MIN:
+            raise SettingsError(f"cones_max: expected more than {CONES_MIN:g}, found {self.cones_max:g}")
+        if not self.readings or min(self.readings) < 1:
+            raise SettingsError(f"readings: expected numbers of at least 1, found {self.readings}")

@@ -16,8 +16,7 @@ from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import left_of, path_lengths
 from pathspace_graph.labels import LEFT, RIGHT
 
-from .bspline import BSpline, dot, segments_cross, sparse_rows
-from .knots import SAMPLED_WEIGHT, LeastSquares
+from .bspline import SAMPLED_WEIGHT, BSpline, LeastSquares, dot, segments_cross, sparse_rows
 
 RIBBON: Final = 3  # entries of a ribbon's control point: x, y (m, map frame) and half the width h (m)
 SIDE: Final = {LEFT: 1.0, RIGHT: -1.0}  # side of the centre line of each label's edge

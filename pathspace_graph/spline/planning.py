@@ -17,18 +17,10 @@ from pathspace_graph.factors.bspline import SpanPolynomials
 from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.se2 import left_of, path_lengths, to_vehicle, wrap_angle
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
-from pathspace_graph.settings.output import SpeedSettings
+from pathspace_graph.settings.mapper import SpeedSettings
 
+from . import centre_line as lines
 from .bspline import BSpline, cross, dot, sparse_rows
-from .centre_line import (
-    RIBBON,
-    SAMPLE_STEP,
-    CentreCurve,
-    NormalCrossing,
-    SampledBoundary,
-    find_line,
-    paired,
-)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -119,7 +111,7 @@ def centre_line(left: BSpline, right: BSpline, covariance: Array | None, step: f
     most, longest = MOST_POINTS * step, max(left.length(), right.length())
     if longest > most:
         raise SettingsError(f"expected boundaries of at most {most:g} m at this step, found {longest:.6g} m")
-    line, closed = find_line(left, right), left.periodic
+    line, closed = lines.find_line(left, right), left.periodic
     centre = line.ribbon.centre
     length = centre.length()
     count = max(round(length / step), 4)
@@ -170,7 +162,7 @@ def _uncrossed(points: Array, normal: Array, widths: list[Array], closed: bool) 
 
 
 def _sigmas(
-    line: CentreCurve, u: Array, crossings: list[NormalCrossing], covariance: Array | None
+    line: lines.CentreCurve, u: Array, crossings: list[lines.NormalCrossing], covariance: Array | None
 ) -> list[Array]:
     """Standard deviations (n,) across the line, and of heading, curvature, arc length and both widths.
 
@@ -184,7 +176,7 @@ def _sigmas(
         return [np.full(len(u), np.nan)] * 6
     centre, by_control = line.ribbon.centre, line.by_boundaries.reshape(line.ribbon.size, -1)
     basis = [sparse_rows(*centre.local_basis(u, order), centre.size) for order in range(3)]
-    moved = [(B @ by_control).reshape(len(u), RIBBON, -1)[:, :2] for B in basis]
+    moved = [(B @ by_control).reshape(len(u), lines.RIBBON, -1)[:, :2] for B in basis]
     tangent = centre.tangent_unit(u)
     normal, curvature = left_of(tangent), centre.curvature(u)[:, None]
     _, first, second, third = centre.derivatives(u, 3)
@@ -280,7 +272,7 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
     if len(known) < len(BOUNDARIES):
         return nothing
     stretches = known[LEFT], known[RIGHT]
-    i, j = paired(*stretches, starts=16)
+    i, j = lines.paired(*stretches, starts=16)
     if len(i) < 2:
         return nothing
     (left, first), (right, second) = stretches[0].at(i), stretches[1].at(j)
@@ -298,7 +290,9 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
     points = np.column_stack([x, y])
     for _ in range(8):  # Newton steps; two are mostly enough
         feet = [
-            foot_points(one.spline.tables, one.spline.control_points, points, u - step, u + step, SAMPLE_STEP)
+            foot_points(
+                one.spline.tables, one.spline.control_points, points, u - step, u + step, lines.SAMPLE_STEP
+            )
             for one, u in zip(stretches, places, strict=True)
         ]
         places = [foot.u for foot in feet]
@@ -306,7 +300,7 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
         inside = feet[0].interior & feet[1].interior
         if not inside.all():  # a point may lie a little past the end of a boundary
             beyond = np.abs([dot(points - foot.position, foot.tangent_unit) for foot in feet])
-            inside = np.asarray((beyond <= 0.5 * SAMPLE_STEP).all(axis=0))
+            inside = np.asarray((beyond <= 0.5 * lines.SAMPLE_STEP).all(axis=0))
         if not (inside & (np.abs(off) > _SETTLED)).any():
             break
         points = points - (off / np.maximum(dot(both, both), np.finfo(float).tiny))[:, None] * both
@@ -340,7 +334,7 @@ def track_ahead(curves: Mapping[int, CurveAhead], pose: Array, distance: float, 
 
 
 @dataclass(frozen=True, eq=False)
-class _Stretch(SampledBoundary):
+class _Stretch(lines.SampledBoundary):
     """Samples of a boundary whose parameter is 0 beside the vehicle."""
 
     curvature: Array  # (n,) in 1/m
@@ -360,10 +354,10 @@ def _stretch(curve: CurveAhead, distance: float) -> _Stretch:
         end = min(end, begin + tables.length)  # at most one period
     else:
         end = min(end, tables.high, curve.until)
-        begin = min(max(begin, tables.low), end - SAMPLE_STEP)
+        begin = min(max(begin, tables.low), end - lines.SAMPLE_STEP)
     # put a sample beside the vehicle, unless the curve begins or ends there
-    low, high = (begin - beside) / SAMPLE_STEP + _SETTLED, (end - beside) / SAMPLE_STEP - _SETTLED
-    u = SAMPLE_STEP * np.arange(floor(low), ceil(high) + 1, dtype=np.float64)
+    low, high = (begin - beside) / lines.SAMPLE_STEP + _SETTLED, (end - beside) / lines.SAMPLE_STEP - _SETTLED
+    u = lines.SAMPLE_STEP * np.arange(floor(low), ceil(high) + 1, dtype=np.float64)
     u[[0, -1]] = begin - beside, end - beside
     values, span = tables.evaluate(beside + u, 2)
     columns = span[:, None] + np.arange(-tables.degree, 1)
@@ -378,7 +372,7 @@ def _stretch(curve: CurveAhead, distance: float) -> _Stretch:
         points, nodes = np.concatenate([points, tentative]), np.append(u, end + np.cumsum(lengths))
     spline = BSpline.hermite(nodes, points, slopes)
     if len(tentative):
-        beyond = np.linspace(end, nodes[-1], ceil((nodes[-1] - end) / SAMPLE_STEP) + 1)[1:]
+        beyond = np.linspace(end, nodes[-1], ceil((nodes[-1] - end) / lines.SAMPLE_STEP) + 1)[1:]
         u, places = np.append(u, beyond), np.concatenate([places, spline.derivatives(beyond, 2)], axis=1)
     some = np.append(np.arange(0, len(u) - 1, 2), len(u) - 1)  # every other sample is paired
     u, (points, first, second) = u[some], places[:, some]

@@ -33,7 +33,7 @@ from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.knots import fit_spline
+from pathspace_graph.spline.bspline import fit_spline
 
 from ..scenes.batch import COURSE, course_log
 from ..scenes.drives import bean_track, lap_log, noisy, true_poses

@@ -94,17 +94,6 @@ def test_where_all_fail_the_tables_say_so(
     assert (out / "table.tex").exists() and not list(out.rglob("*.png"))
 
 
-@pytest.mark.slow
-def test_several_logs_have_folders_of_their_own_and_intervals(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], png_only: None
-) -> None:
-    out = tmp_path / "out"
-    assert main(["compare", str(folder), "--out", str(out), "--estimators", "rings", "gaps"]) == 0
-    assert "mean over 2 logs" in capsys.readouterr().out
-    assert {path.name for path in out.iterdir() if path.is_dir()} == {"a", "b"}
-    assert {path.name for path in (out / "b").iterdir()} >= {"rings", "gaps", "maps.png"}
-
-
 def test_without_truth_the_command_says_so_and_draws_the_maps(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], png_only: None
 ) -> None:

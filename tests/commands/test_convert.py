@@ -61,13 +61,6 @@ def test_far_detections_are_left_out_and_stamps_are_moved(
     assert all(np.abs(stamps - cycle.t).min() < 1e-6 for cycle in log.cycles)
 
 
-def test_a_part_of_a_drive_is_cut_out(recorded: Path, tmp_path: Path) -> None:
-    run("convert", recorded, *OPTIONS, "--start", "2", "--end", "8", "--out", tmp_path / "log")
-    log, begin = read_log(tmp_path / "log"), camera_drive().odometry.t[0]
-    assert log.odometry.t[0] >= begin + 2.0 and log.odometry.t[-1] <= begin + 8.0
-    assert all(begin + 2.0 <= cycle.t <= begin + 8.0 for cycle in log.cycles)
-
-
 @pytest.mark.parametrize(
     ("kind", "options", "expected"),
     [

@@ -13,10 +13,9 @@ from typing import Any
 
 import pytest
 
-from pathspace_graph.cli import BROKEN_PIPE, main, parse
+from pathspace_graph.cli import BROKEN_PIPE, ESSENTIAL, main, parse
 from pathspace_graph.io.files import write_json
-from pathspace_graph.io.overrides import leaves
-from pathspace_graph.options.help import ESSENTIAL
+from pathspace_graph.settings.checked import leaves
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
 from pathspace_graph.sim.simulate import PRESETS, SimulationSettings
 
@@ -90,8 +89,6 @@ def test_options_of_several_values() -> None:
     assert (given.labels, given.columns) == (("left=1", "right=0"), ("wz=-yaw",))
     assert options_of("batch", "a", "b", "--out", "M").log == (Path("a"), Path("b"))
 
-
-def test_options_that_are_called_otherwise_than_their_field() -> None:
     assert options_of("convert", "B", "--out", "L", "--from", "csv").kind == "csv"
     assert options_of("export", "M", "--as", "tum", "--out", "-").out == Path("-")
 

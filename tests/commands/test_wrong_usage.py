@@ -21,71 +21,50 @@ help onlin | found 'onlin', the nearest is 'online'
 zzz | report), found 'zzz'
 online | --log requires an argument
 online LOG | --out requires an argument
-online LOG --out | --out requires an argument
-online LOG --out --lag 2 | --out requires an argument
 online LOG MAP --out X | ['MAP']
 online LOG --out MAP | LOG: expected a log folder
 online LOG --out MAP --lag long | --lag: unable to convert "long"
 online LOG --out MAP --lag nan | lag: expected a positive number, found nan
-online LOG --out MAP --lag -1 | lag: expected a positive number, found -1
 online LOG --out MAP --lag 2 --lag 3 | --lag specified multiple times
 online LOG --out MAP --zzz 1 | Unknown option: --zzz
-online LOG --out MAP --estimatr ckf | Did you mean --estimator?
 online LOG --out MAP --estimator magic | ckf, fixed-lag, landmark-ckf, landmark-fixed-lag), found 'magic'
-online LOG --out MAP -o X | Unknown option: -o
 online LOG --out MAP --gate 3 | Unknown option: --gate
 online LOG --out MAP --max-poses 2.7 | --max-poses: unable to convert
 online LOG --out MAP --keep-map=x | --keep-map: unable to convert
 online LOG --out MAP --noise x | Choose from: "measured", "stated"
 online LOG --out MAP --plot map.doc | map.doc: expected a file name that ends
-online LOG --out MAP --settings --lag 3 | --settings requires an argument
 online LOG --out MAP --settings none.toml | none.toml: expected a file of settings, found none
 online LOG --out MAP --spline.degree 0 | spline.degree: expected a positive whole number
-online LOG --out MAP --gauge.sigma-spacing inf | gauge.sigma_spacing: expected a positive number
-online LOG --out MAP --gate.huber nan | gate.huber: expected a positive number or inf
 online LOG --out MAP --start 0 0 0 | --start: expected --on MAP as well, found none
 online LOG --out MAP --keep-map | --keep-map: expected --on MAP as well, found none
 online LOG --out MAP --on map --estimator ckf | --on: expected --estimator fixed-lag, found ckf
 online LOG --out MAP --on map --start 1 2 | --start requires 3
 online LOG --out MAP --on map --map-sigma 0 | map_sigma: expected a positive number, found 0
 online LOG --out MAP --on nowhere | nowhere: expected a map's folder, a track file, skidpad or acceleration
-batch --out MAP | --log requires an argument
 batch a b --out MAP --estimator landmark-batch | --estimator: expected spline for several logs
 batch a b --out MAP | a: expected a log folder, found none
-export map --out F | --as requires an argument
 export map --out F --as word | --as. Choose from: "centerline", "tum"
 export map --out F --as geojson | --origin: expected LATITUDE LONGITUDE HEADING in degrees
-export map --out F --as lanelet2 | which --as lanelet2 needs
 export map --out F --as lanelet2 --origin 95 0 0 | origin: expected a latitude between -90 and 90 degrees
 export map --out F --as lanelet2 --origin 9 9 0 | map.json: lanelet2: expected a curve as left boundary
 export map --out F --as centerline | map.json: a centre line: expected a curve as left boundary
 export map --out F --as points --stop | --start-speed, --stop: expected --as profile
 export map --out F --as points --step 0 | --step: expected a number of at least
-export map --out F --as points --step nan | --step: expected a number of at least
 export map --out F --as tum | trajectory.tum: expected a trajectory, found none
 plot map --out map.doc | map.doc: expected a file name that ends
 plot MAP --out map.png | map.json: expected a map, found none
-plot map --out map.png --band-scale 0 | band_scale: expected a positive number
-convert --from csv --out LOG | --source requires an argument
 convert BAG --out LOG --sigma-odometry 1 2 | --sigma-odometry requires 3
 convert BAG --out LOG --mounting 1 -2 a | --mounting: unable to convert "a"
-convert BAG --out LOG --range-max 0 | range_max: expected a positive number, found 0
 convert BAG --out LOG --start 3 --end 2 | start: expected less than end, found 3 and 2
 convert BAG --out LOG --time-offset nan | time_offset: expected a number, found nan
 simulate --out LOG | expected one of --track FILE, --generate SEED or --event NAME
-simulate --generate 1 --event skidpad --out LOG | expected one of --track FILE
-simulate LOG --generate 1 --out X | ['LOG']
 simulate --generate 99999999999999999999 --out LOG | --generate: unable to convert
 simulate --generate 1 --sensor lidar --out LOG | sensor
 simulate --generate -1 --out LOG | seed of a generated track: expected at least 0
-simulate --generate 1 --laps 0 --out LOG | laps: expected a positive whole number
-simulate --generate 1 --out LOG --sensor.fov nan | sensor.fov: expected a positive number
 simulate --event skidpad --out LOG --faults.sensor.colourless 2 | colourless: expected a number in [0, 1]
 simulate --track none.yaml --out LOG | none.yaml: expected a track file, found none
 compare map --out D --estimators nothing | 'nothing'
 ablate lagg --out D | the nearest is 'lag'
-ablate none.toml --out D | none.toml
-ablate lag --out D --tracks | --tracks requires at least 1 element
 ablate lag --out D --jobs 0 | jobs: expected
 ablate lag --out D --laps 0 | --laps: expected at least 1
 ablate lag --out D --baseline lagg | --baseline: expected a variant or an estimator

@@ -53,10 +53,6 @@ def beginning_of(log: Log, cycles: int) -> Log:
     return Log(log.odometry.between(0.0, kept[-1].t), kept, log.odometry_sigma, log.sensor)
 
 
-STATED = ("--sigma-odometry", "0.25", "0.12", "0.035")
-"""The noise of the odometry that the simulator has."""
-
-
 def convert(bag: Path, out: Path, *options: str) -> Log:
     assert main(["convert", str(bag), "--out", str(out), *TOPICS, *options]) == 0
     return read_log(out)
@@ -100,8 +96,11 @@ def test_a_folder_is_a_bag_of_rosbag2_whatever_its_name(drive: Log, tmp_path: Pa
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_drive_comes_back_from_a_bag(kind: Kind, drive: Log, tmp_path: Path) -> None:
-    bag = write_bag(tmp_path, kind, of_log(drive, Messages.cloud_of))
+@pytest.mark.parametrize("message", [Messages.cloud_of, Messages.cones])
+def test_a_drive_comes_back_from_a_bag(
+    kind: Kind, message: Callable[[Messages, Detections], Any], drive: Log, tmp_path: Path
+) -> None:
+    bag = write_bag(tmp_path, kind, of_log(drive, message))
     log = convert(bag, tmp_path / "log")
     assert_same_readings(log, drive)
     assert log.detections_stated and not log.odometry_stated
@@ -109,14 +108,6 @@ def test_a_drive_comes_back_from_a_bag(kind: Kind, drive: Log, tmp_path: Path) -
     np.testing.assert_array_equal(log.noise.twist.white, log.measured.odometry)
     np.testing.assert_array_equal(log.noise.twist.drift, log.measured.drift)
     assert log.source["odometry"] == "/odom (nav_msgs/msg/Odometry)"
-
-
-def test_noise_that_is_stated_is_not_measured(drive: Log, tmp_path: Path) -> None:
-    bag = write_bag(tmp_path, "mcap", of_log(drive, Messages.cloud_of))
-    log = convert(bag, tmp_path / "log", *STATED)
-    assert log.odometry_stated and log.detections_stated and log.measured is None
-    np.testing.assert_array_equal(log.odometry_sigma, [0.25, 0.12, 0.035])
-    assert "noise" not in (tmp_path / "log" / "log.toml").read_text()
 
 
 def test_noise_that_is_not_stated_is_measured_and_the_log_says_so(long_drive: Log, tmp_path: Path) -> None:
@@ -133,12 +124,6 @@ def test_noise_that_is_not_stated_is_measured_and_the_log_says_so(long_drive: Lo
         expected = log.measured.covariances(cycle.points_vehicle, inflated=False)
         assert expected is not None
         np.testing.assert_allclose(cycle.covariances, expected, rtol=1e-12, atol=1e-15)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_cones_with_covariances_come_back_from_a_bag(kind: Kind, drive: Log, tmp_path: Path) -> None:
-    bag = write_bag(tmp_path, kind, of_log(drive, Messages.cones))
-    assert_same_readings(convert(bag, tmp_path / "log"), drive)
 
 
 def test_an_old_bag_without_definitions_is_read_by_those_handed_over(
@@ -508,10 +493,6 @@ def test_a_wrong_topic_lists_all_with_types_counts_and_rates(
         ([*TOPICS, "--labels", "blue=0"], "--labels: expected LABEL=VALUE"),
         ([*TOPICS, "--mounting", "0", "0", "90"], "mounting: expected a yaw of at most 2 pi rad, found 90"),
         ([*TOPICS, "--definition", "cone.txt"], "cone.txt"),
-        (
-            [*TOPICS, "--sigma-odometry", "1", "0", "1"],
-            "sigma_odometry: expected a list of 3 values, each a positive number",
-        ),
         (
             [*TOPICS, "--start", "9"],
             "found none; 11 odometry samples outside --start and --end were left out",

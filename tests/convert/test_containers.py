@@ -11,7 +11,6 @@ import pytest
 from pathspace_graph.cli import main
 from pathspace_graph.convert.bag import described
 
-CASES = Path(__file__).parents[3] / "shared" / "cases"
 MAGIC = b"\x89MCAP0\r\n"
 
 
@@ -100,11 +99,3 @@ def test_a_file_of_another_kind_is_named(
         file.write_bytes(content)
         assert f"expected a ROS bag, found {said}" in refused(file, capsys)
         file.unlink()
-
-
-@pytest.mark.skipif(not CASES.is_dir(), reason="the cases of others aren't beside the repository")
-def test_the_case_of_others_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "log"
-    assert main(["convert", str(CASES / "protobuf_mcap" / "proto.mcap"), "--out", str(out)]) == 2
-    said = capsys.readouterr().err
-    assert "an MCAP file of protobuf messages (profile '')" in said and "/cones (car.VehicleState)" in said

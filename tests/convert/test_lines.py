@@ -10,20 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial import KDTree
 
 from pathspace_graph.cli import main
 from pathspace_graph.convert.messages import ALONE, DENSE, Points, points_of
-from pathspace_graph.convert.recording import ReckonedPath, along_lines, lines_of, resampled, spaced_apart
+from pathspace_graph.convert.recording import ReckonedPath, lines_of, spaced_apart
 from pathspace_graph.convert.settings import Frames, LabelRule
-from pathspace_graph.estimators import make_online
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.io.log_files import read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.ros.node import MessageStream
-from pathspace_graph.run import run_online
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import sampled
 
 from ..scenes.corridor import MOUNTING, RANGE_MAX, Corridor, corridor, write_json_lines
 from .bags import Messages
@@ -96,13 +91,6 @@ def test_lists_of_points_and_arrays_are_polylines() -> None:
 # --- spacing ---------------------------------------------------------------------------------------------
 
 
-def test_a_polyline_is_interpolated_at_multiples_of_the_spacing() -> None:
-    corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 3.0]])
-    expected = [[0.0, 0.0], [0.8, 0.0], [1.0, 0.6], [1.0, 1.4], [1.0, 2.2], [1.0, 3.0]]
-    np.testing.assert_allclose(resampled(corner, 0.8), expected, atol=1e-12)
-    np.testing.assert_array_equal(resampled(corner[:1], 0.8), corner[:1])
-
-
 def test_dense_points_are_thinned_by_bearing_to_a_spacing() -> None:
     # a wall 2 m to the right from behind to ahead: bearings grow with x
     x = np.arange(-1.0, 1.0, 0.1)
@@ -121,13 +109,6 @@ def test_thinning_does_not_choose_by_range() -> None:
     assert np.hypot(*points[kept].T).mean() == pytest.approx(2.0, abs=0.015)
     apart = np.linalg.norm(points[kept][:, None] - points[kept], axis=2) + np.eye(len(kept))
     assert apart.min() >= 0.05
-
-
-def test_polylines_keep_their_labels_and_lose_no_other_points() -> None:
-    mixed = Points.of([[1.0, 1.0], [5.0, 1.0], [2.0, -1.0]], [LEFT, LEFT, UNKNOWN], lines=[0, 0, DENSE])
-    found = along_lines(mixed, 2.0)
-    np.testing.assert_allclose(found.points, [[2.0, -1.0], [1.0, 1.0], [3.0, 1.0], [5.0, 1.0]])
-    assert found.labels.tolist() == [UNKNOWN, LEFT, LEFT, LEFT]
 
 
 # --- sides -----------------------------------------------------------------------------------------------
@@ -242,21 +223,6 @@ def test_the_walls_of_a_corridor_have_their_sides(scene: Corridor, tmp_path: Pat
         true = np.where(to_left < to_right, LEFT, RIGHT)
         np.testing.assert_array_equal(cycle.labels[labelled], true[labelled])
     assert known > 0.9 * sum(counts[::10])
-
-
-@pytest.mark.slow
-def test_the_corridor_is_mapped(tmp_path: Path) -> None:
-    """A lap of 60 m closes, and both walls are mapped within a decimetre, their kinks within two."""
-    scene = corridor(laps=2)
-    log = converted(write_json_lines(scene, tmp_path / "car.jsonl"), tmp_path / "log", "--from", "jsonl")
-    settings = MapperSettings()
-    result = run_online(log, make_online("fixed-lag", settings, log), name="fixed-lag")
-    assert result.map.closed
-    for name, wall in (("left", scene.left), ("right", scene.right)):
-        curve = sampled(result.map.boundaries[name].spline, 0.02)
-        distance = KDTree(curve).query(wall)[0]
-        assert np.sqrt(np.mean(distance**2)) < 0.08 and distance.max() < 0.2
-        assert result.map.boundaries[name].size <= 40
 
 
 def test_json_lines_hold_polylines(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ FILE = Path("drive")
 
 def record(points: Points, t: float = 0.5) -> Recording:
     twists = np.array([[1.0, 0.2, 0.3], [1.0, 0.2, 0.3]])
-    return Recording(np.array([0.0, 1.0]), twists, np.array([t]), points, {})
+    return Recording(np.array([0.0, 1.0]), twists, np.array([t]), points, {}, np.array([1, 2]), "row")
 
 
 def one(x: float, y: float, covariance: object = np.nan) -> Points:
@@ -92,7 +92,7 @@ def driven_at(t: np.ndarray, scan_t: np.ndarray) -> Recording:
     """A record with these stamps (s), whose k-th message has a speed of k and a cone at k + 2."""
     speeds = np.outer(np.arange(len(t)), [1.0, 0.0, 0.0])
     points = Points.joined([one(k + 2.0, 1.0) for k in range(len(scan_t))])
-    return Recording(t, speeds, scan_t, points, {}, is_held=True)
+    return Recording(t, speeds, scan_t, points, {}, np.arange(len(t)) + 1, "row", is_held=True)
 
 
 ONCE = np.arange(0.0, 24.01, 0.5)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pathspace_graph.convert.settings import Frames
 from pathspace_graph.errors import PathspaceError, SettingsError
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.io.files import write_json
@@ -26,7 +25,7 @@ from pathspace_graph.sim.track_generator import generate_track
 
 from ..scenes.maps import ring_map
 from .bags import EPOCH, Messages
-from .ros2 import Node, ReliabilityPolicy, install, message_class
+from .ros2 import Node, ReliabilityPolicy, install
 
 CYCLES = 40
 ODOM_T_START = np.array([7.0, -3.0, 1.2])
@@ -124,19 +123,6 @@ def test_parameters_of_a_wrong_size_are_refused() -> None:
         ros.Bridge(mounting=(1.0, 2.0))
     with pytest.raises(SettingsError, match="expected three numbers"):
         ros.Bridge(sigma=(1.0, 2.0))
-
-
-def test_markers_and_poses_are_filled_in() -> None:
-    points, point = np.array([[1.0, 2.0], [3.0, 4.0]]), message_class("geometry_msgs/Point")
-    marker = ros.fill_line(message_class("visualization_msgs/Marker")(), points, LEFT, point)
-    assert [(at.x, at.y, at.z) for at in marker.points] == [(1.0, 2.0, 0.0), (3.0, 4.0, 0.0)]
-    assert marker.color.b > marker.color.r and marker.type == marker.LINE_STRIP
-    blank = message_class("visualization_msgs/Marker")()
-    assert ros.fill_line(blank, points, RIGHT, point).color.r > 0.5
-    filled = message_class("geometry_msgs/Pose")()
-    ros.fill_pose(filled.position, filled.orientation, np.array([1.0, 2.0, np.pi]))
-    assert (filled.position.x, filled.position.y) == (1.0, 2.0)
-    assert filled.orientation.z == pytest.approx(1.0)
 
 
 def spun(monkeypatch: pytest.MonkeyPatch, drive: Callable[[Node], None], **parameters: Any) -> Node:
@@ -300,14 +286,6 @@ def test_messages_without_a_stamp_have_the_time_of_receipt(messages: Messages) -
     cycle = taken(stream, cloud(messages, None), 7.5)
     assert cycle[0].t.tolist() == [7.0]
     assert cycle[1].t == 7.5
-
-
-def test_the_frames_are_those_of_the_vehicle(messages: Messages) -> None:
-    stream = MessageStream(Frames((1.0, 0.0, 0.0), y="right"))
-    stream.take_odometry(messages.odometry(0.0, TWIST), 0.0)
-    cycle = taken(stream, cloud(messages, 0.1))
-    np.testing.assert_allclose(cycle[0].twist, [[3.0, -0.1, -0.5]])
-    np.testing.assert_allclose(cycle[1].points_vehicle, [[6.0, -1.5]])
 
 
 @pytest.mark.parametrize("broken", [None, 3, SimpleNamespace(), SimpleNamespace(header=None, twist=None)])

@@ -19,13 +19,11 @@ from pathspace_graph.factors.odometry import integrate_poses
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.plausibility.judge import read_plausible_log
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.settings.mapper import LimitSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
 from ..scenes.drives import SHORT
-
-CASES = Path(__file__).parents[3] / "shared" / "cases"
 
 
 @cache
@@ -79,7 +77,7 @@ def convert(source: Path, *options: str, code: int = 0) -> Path:
 
 
 @pytest.mark.parametrize("step", [1, 5, 10, 25])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_row_of_a_drive_as_it_is_jumps(seed: int, step: int) -> None:
     t, *rest = table(drive(seed), step).T
     assert not recording.jumps(t, np.array(rest).T).any()
@@ -87,7 +85,7 @@ def test_no_row_of_a_drive_as_it_is_jumps(seed: int, step: int) -> None:
 
 @pytest.mark.parametrize("central", [False, True])
 @pytest.mark.parametrize("step", [1, 2, 5, 10, 25])
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_yaw_that_wraps_is_found_at_any_rate(seed: int, step: int, central: bool) -> None:
     rows, wrong = differenced(drive(seed), step, central=central)
     off = recording.jumps(rows[:, 0], rows[:, 1:])
@@ -207,7 +205,7 @@ FORMS = ("wrapped", "theta", "degrees", "clockwise", "quaternion", "moved", "bes
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("step", [1, 5, 10])
+@pytest.mark.parametrize("step", [1, 10])
 def test_poses_in_a_table_give_the_way_that_was_driven(
     form: str, step: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -348,9 +346,8 @@ def test_the_noise_of_interpolated_twists_is_that_of_the_samples() -> None:
     np.testing.assert_allclose(stated.odometry_sigma, 2.0 * log.odometry_sigma)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_an_odometry_of_five_hertz_maps_the_first_lap(seed: int, tmp_path: Path) -> None:
-    log = drive(seed)
+def test_an_odometry_of_five_hertz_maps_the_first_lap(tmp_path: Path) -> None:
+    log = drive()
     out = convert(write(tmp_path, log, table(log, 10)))
     for name in ("truth_poses.csv", "truth_cones.csv"):
         shutil.copy(tmp_path / "whole" / name, out)

@@ -40,8 +40,7 @@ from pathspace_graph.eval.benchmark import (
     write_scaling,
 )
 from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.settings.evaluation import ScalingSettings
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.settings.mapper import MapperSettings, ScalingSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from ..scenes.drives import ahead, bean_track, beginning, corridor, exact_log

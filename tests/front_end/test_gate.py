@@ -20,7 +20,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.plausibility.judge import read_plausible_log
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.settings.mapper import LimitSettings
 
 from ..scenes.drives import ahead, corridor, exact_log
 

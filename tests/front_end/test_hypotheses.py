@@ -13,7 +13,7 @@ from pathspace_graph.factors.se2 import compose, left_of, relative, rotation, to
 from pathspace_graph.factors.sensor import SENSOR, by_sensor
 from pathspace_graph.front_end.motion import MATCHING, MotionCheck
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.settings.online import MotionSettings
+from pathspace_graph.settings.mapper import MotionSettings
 
 from ..scenes.drives import detections
 

@@ -9,7 +9,7 @@ from pathspace_graph.front_end.log_odometry import chained, half_square, sensor_
 from pathspace_graph.graph.variables import SENSOR_KEY, Variables, pose_keys
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry
-from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
+from pathspace_graph.settings.mapper import CalibrationSettings, OdometrySettings
 
 KNOWN, ESTIMATED = CalibrationSettings(sensor=False), CalibrationSettings()
 

@@ -16,7 +16,7 @@ from pathspace_graph.front_end.motion import MATCHING, Matching, MotionCheck
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.online import MotionSettings
+from pathspace_graph.settings.mapper import MotionSettings
 from pathspace_graph.sim.sensor import OdometryNoise
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.vehicle import VehicleSettings

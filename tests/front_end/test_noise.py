@@ -15,8 +15,7 @@ from pathspace_graph.front_end.front_end import FrontEnd, judge_log, measure_log
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
+from pathspace_graph.settings.mapper import CalibrationSettings, MapperSettings, OdometrySettings
 
 from ..scenes.drives import detections, short_drive
 

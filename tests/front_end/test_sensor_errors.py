@@ -12,8 +12,7 @@ from pathspace_graph.front_end.front_end import FrontEnd, judge_log
 from pathspace_graph.front_end.motion import MotionCheck
 from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import CalibrationSettings, MotionSettings
+from pathspace_graph.settings.mapper import CalibrationSettings, MapperSettings, MotionSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.sensor import OdometryNoise
 from pathspace_graph.sim.simulate import SimulationSettings, simulate

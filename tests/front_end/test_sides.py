@@ -14,8 +14,7 @@ from pathspace_graph.front_end.sides import ConeRow, SideJudge, extend_rows
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT, ORANGE, RIGHT, UNKNOWN
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import SidesSettings
+from pathspace_graph.settings.mapper import MapperSettings, SidesSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults, VehicleFaults
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.vehicle import VehicleSettings

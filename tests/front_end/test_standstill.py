@@ -20,8 +20,7 @@ from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online, split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import MotionSettings
+from pathspace_graph.settings.mapper import MapperSettings, MotionSettings
 from pathspace_graph.sim.faults import Faults, OdometryFaults
 from pathspace_graph.sim.sensor import OdometryNoise
 from pathspace_graph.sim.simulate import SimulationSettings, simulate

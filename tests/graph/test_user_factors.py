@@ -26,8 +26,7 @@ from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.labels import RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import OdometrySettings
+from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
 from pathspace_graph.sim.vehicle import integrate
 
 from ..scenes.drives import CYCLE, DT, ODOMETRY_SIGMA, bean_track, exact_log, lap_log, true_poses

@@ -26,7 +26,7 @@ from pathspace_graph.io.export import (
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
 from pathspace_graph.io.tables import read_table
 from pathspace_graph.labels import BIG_ORANGE, LEFT, ORANGE, RIGHT
-from pathspace_graph.settings.output import SpeedSettings
+from pathspace_graph.settings.mapper import SpeedSettings
 from pathspace_graph.spline.planning import speed_profile
 
 from ..scenes.maps import open_map, point_map, ring_map

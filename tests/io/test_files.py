@@ -32,12 +32,6 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_new_folder_with_its_parents(tmp_path: Path) -> None:
-    write_result(tmp_path / "a" / "b", "1")
-    assert (tmp_path / "a" / "b" / "marker").read_text() == "1"
-    assert names(tmp_path / "a") == ["b"]
-
-
 @pytest.mark.parametrize("system", ["Linux", "other"])
 def test_an_earlier_result_is_refused_or_replaced_by_force(
     system: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -131,11 +131,6 @@ def test_missing_or_empty_file(folder: Path, name: str) -> None:
         read_log(folder)
 
 
-def test_missing_folder(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected a log folder"):
-        read_log(tmp_path / "absent")
-
-
 HEADER = 'format = "pathspace-log/1"\n[odometry]\nsigma = [1, 1, 1]\n'
 ODOMETRY = "t,vx,vy,wz\n"
 DETECTIONS = "t,x,y,label,xx,xy,yy\n"

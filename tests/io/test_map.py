@@ -27,8 +27,7 @@ from pathspace_graph.io.map import (
     read_map,
 )
 from pathspace_graph.labels import BOUNDARIES, LEFT, ORANGE, RIGHT
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import fit_spline
+from pathspace_graph.spline.bspline import BSpline, fit_spline
 
 from ..scenes.maps import SIGMA, open_map, ring_map
 
@@ -108,15 +107,6 @@ def test_scipy_evaluates_the_written_map_the_same() -> None:
         np.testing.assert_allclose(
             ScipyBSpline(knots, points, int(degree))(u), boundary.spline.evaluate(u), atol=1e-12
         )
-
-
-def test_a_periodic_boundary_repeats_its_first_control_points_and_counts_them_once() -> None:
-    content = map_to_json(spline_map())["boundaries"]["left"]
-    assert content["periodic"] is True
-    assert len(content["control_points"]) == 9 + 3
-    assert content["control_points"][-3:] == content["control_points"][:3]
-    assert content["size"] == 9
-    assert np.shape(content["covariance"]) == (18, 18)
 
 
 @pytest.mark.parametrize("named", ["", MAP_FILE])

@@ -25,7 +25,7 @@ from pathspace_graph import (
     split_odometry,
     write_log,
 )
-from pathspace_graph.io.brief import brief
+from pathspace_graph.brief import brief
 
 from ..scenes.drives import short_drive
 

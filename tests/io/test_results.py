@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import pytest
 from pathspace_graph.errors import InputError
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.map import Map, PointBoundary
-from pathspace_graph.io.results import SMOOTHED_FILE, CycleRecord, RunResult, write_result, write_trajectory
+from pathspace_graph.io.results import CycleRecord, RunResult, write_result, write_trajectory
 from pathspace_graph.io.tables import read_table, read_trajectory
 from pathspace_graph.labels import LEFT
 
@@ -57,15 +56,6 @@ def test_the_folder_holds_the_four_files_of_the_contract(tmp_path: Path) -> None
     assert read == {"estimator": "fixed-lag", "ate": None, "laps": [{"lap": 1, "rmse": 0.5}]}
     assert made["commit"] and made["machine"]
     assert abs((datetime.fromisoformat(made["date"]) - datetime.now(UTC)).total_seconds()) < 600.0
-
-
-def test_a_smoothed_trajectory_has_a_file_of_its_own(tmp_path: Path) -> None:
-    smoothed = result().trajectory + np.array([1.0, -2.0, 0.1])
-    write_result(tmp_path / "map", replace(result(), smoothed=smoothed), {})
-    stamps, read = read_trajectory(tmp_path / "map" / SMOOTHED_FILE)
-    np.testing.assert_array_equal(stamps, result().trajectory_t)
-    np.testing.assert_allclose(read[:, :2], smoothed[:, :2], atol=1e-9)
-    np.testing.assert_allclose(np.cos(read[:, 2] - smoothed[:, 2]), 1.0)
 
 
 def test_a_trajectory_comes_back_as_it_was_written(tmp_path: Path) -> None:

@@ -14,8 +14,7 @@ from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import ClosingSettings
+from pathspace_graph.settings.mapper import ClosingSettings, MapperSettings
 from pathspace_graph.spline.boundary import relocate
 
 from ..scenes.drives import (

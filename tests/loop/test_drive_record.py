@@ -19,8 +19,7 @@ from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry, known_noise
 from pathspace_graph.mapping.road import Road
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import OdometrySettings
+from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
 
 from ..scenes.maps import boundary_through
 

@@ -25,8 +25,7 @@ from pathspace_graph.loop.known_loop import KnownLoop, evidence_of
 from pathspace_graph.loop.lost import FOUND, LEAST_PATH, WIDENING, Search, restart_window
 from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.places.find import KnownRoad, Place
-from pathspace_graph.places.passes import STRETCH
+from pathspace_graph.places.find import STRETCH, KnownRoad, Place
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 

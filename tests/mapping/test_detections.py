@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pathspace_graph.baselines.landmark_map import LandmarkDetections
+from pathspace_graph.baselines.landmarks import LandmarkDetections
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable

@@ -13,7 +13,7 @@ from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.labels import BIG_ORANGE, ORANGE
 from pathspace_graph.mapping.orange import OrangeDetections, orange_cones
-from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.settings.mapper import GrowthSettings
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.mapping import path as path_module
 from pathspace_graph.mapping.path import DrivenPath, PathAhead, along_and_across
-from pathspace_graph.settings.online import ClosingSettings
+from pathspace_graph.settings.mapper import ClosingSettings
 
 Array = NDArray[np.float64]
 

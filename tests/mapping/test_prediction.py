@@ -24,8 +24,7 @@ from pathspace_graph.mapping.motion import (
 )
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.run import split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import OdometrySettings
+from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
 
 from ..scenes.drives import DT, ODOMETRY_SIGMA, ahead, exact_log, true_poses
 

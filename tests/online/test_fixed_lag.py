@@ -20,8 +20,7 @@ from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
-from pathspace_graph.settings.mapper import GaugeSettings, MapperSettings
-from pathspace_graph.settings.online import GrowthSettings, SidesSettings
+from pathspace_graph.settings.mapper import GaugeSettings, GrowthSettings, MapperSettings, SidesSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 from pathspace_graph.sim.vehicle import integrate

@@ -16,8 +16,7 @@ from pathspace_graph.mapping import growth
 from pathspace_graph.mapping.growth import _uncrossed, check_order, end_of, undisputed
 from pathspace_graph.mapping.path import END_BEHIND, Candidates, End, PathAhead
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.settings.mapper import GrowthSettings, MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 
 from ..scenes.drives import DT, ahead, corridor, detections, exact_log, map_log, true_poses

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph import FixedLagMapper, ReadingError, SettingsError
 from pathspace_graph.baselines.filters import CkfMapper, LandmarkCkf
-from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
+from pathspace_graph.baselines.landmark_graph import LandmarkFixedLag
 from pathspace_graph.factors.se2 import compose, se2_exp
 from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import pose_key, pose_keys

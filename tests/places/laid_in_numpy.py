@@ -6,9 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import left_of, rotation, wrap_angle
-from pathspace_graph.places.constellation import ConeArrays
+
+ConeArrays = tuple[Array, Array, IntArray]  # points (n, 2), covariances (n, 2, 2) and labels (n,)
 
 GATES: Final = (4.0, 4.0, 2.0, 1.0, 1.0, 1.0)  # factors of the cap in the steps of the refinement
 REGULAR: Final = (1e-2, 1e-2, 1.0)  # information added in a step, so that few cones still give one

@@ -10,20 +10,17 @@ from scipy.spatial.distance import pdist
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, path_lengths
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.places.constellation import (
+from pathspace_graph.places.find import (
     CURVE_SIGMA,
+    FITS_BY_CHANCE,
     LINE_WEIGHT,
     PATH_STEP,
-    Constellation,
-    Prior,
-    SampledCurves,
-)
-from pathspace_graph.places.find import (
-    FITS_BY_CHANCE,
-    LEAST_CONES,
     REACH,
     SURE_ODDS,
+    Constellation,
     KnownRoad,
+    Prior,
+    SampledCurves,
     along,
     find,
     sure,
@@ -167,12 +164,7 @@ def straight(length: float) -> dict[int, BSpline]:
 
 def test_points_are_laid_across_curves_and_not_along() -> None:
     """On a straight, the information along it is that of nothing, and across it that of each point."""
-    x = np.arange(0.0, 60.0, 3.0)
-    splines = {
-        label: BSpline.open_uniform(np.column_stack([x, np.full(len(x), side)]))
-        for label, side in SIDES.items()
-    }
-    known = SampledCurves.of(splines)
+    known = SampledCurves.of(straight(60.0))
     points = np.array([[20.0, 2.0], [25.0, 2.0], [22.0, -2.0], [27.0, -2.0]])
     seen = Constellation(points, np.zeros((4, 2, 2)), np.repeat([LEFT, RIGHT], 2), weight=LINE_WEIGHT)
     start = np.array([0.3, 0.6, 0.02])
@@ -185,23 +177,10 @@ def test_points_are_laid_across_curves_and_not_along() -> None:
 
 
 def test_beyond_the_end_of_an_open_curve_nothing_is_in_view() -> None:
-    x = np.arange(0.0, 30.0, 3.0)
-    splines = {
-        label: BSpline.open_uniform(np.column_stack([x, np.full(len(x), side)]))
-        for label, side in SIDES.items()
-    }
     points = np.array([[5.0, 2.0], [10.0, -2.0], [40.0, 2.0], [-9.0, -2.0]])
     seen = Constellation(points, np.zeros((4, 2, 2)), np.array([LEFT, RIGHT, LEFT, RIGHT]))
-    fits = SampledCurves.of(splines).fits(seen, Prior(np.zeros((1, 3)), np.eye(3), (4.0, 0.3)))
+    fits = SampledCurves.of(straight(30.0)).fits(seen, Prior(np.zeros((1, 3)), np.eye(3), (4.0, 0.3)))
     assert fits.counts[0] == 2.0
-
-
-def test_a_few_points_have_no_place() -> None:
-    known = road(PEAR, True)
-    poses = driven(PEAR, 1.0, 3.0)
-    seen = seen_from(PEAR, poses)
-    few = Constellation(*(column[: LEAST_CONES - 1] for column in seen.cones))
-    assert find(few, known.seen, known.along(poses)) is None
 
 
 def circle(count: int) -> Array:

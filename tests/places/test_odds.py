@@ -10,8 +10,7 @@ import pytest
 from pathspace_graph.batch.known_map import KnownMap, map_of_cones
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, path_lengths, relative, to_vehicle
-from pathspace_graph.places.constellation import MERGE_RANGE, Constellation
-from pathspace_graph.places.find import SURE_ODDS, KnownRoad, find
+from pathspace_graph.places.find import MERGE_RANGE, SURE_ODDS, Constellation, KnownRoad, find
 from pathspace_graph.sim.track_generator import generate_track
 
 TRACKS, SEARCHES = 25, 10

@@ -15,18 +15,20 @@ from pathspace_graph.factors.se2 import compose, left_of, path_lengths, relative
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.detections import DetectionColumns
-from pathspace_graph.places.constellation import (
+from pathspace_graph.places.find import (
+    CLOSES_WITHIN,
     FAILED,
     FIT_SIGMA,
+    FITS_BY_CHANCE,
+    LEAST_CONES,
     MERGE_RANGE,
     PATH_STEP,
+    SURE_ODDS,
     Constellation,
+    Place,
     Prior,
-)
-from pathspace_graph.places.find import FITS_BY_CHANCE, LEAST_CONES, SURE_ODDS, Place, find
-from pathspace_graph.places.passes import (
-    CLOSES_WITHIN,
     SeenIn,
+    find,
     find_return,
     return_to_beginning,
     revisit_of,
@@ -139,7 +141,7 @@ def test_the_heading_may_have_turned_around() -> None:
 def test_the_information_is_that_of_repeated_observations() -> None:
     """Errors of samples have the claimed covariance, but for the efficiency that the cap of squares costs.
 
-    ConeArrays whose errors are those of their covariances alone tell more than is claimed.
+    Cones whose errors are those of their covariances alone tell more than is claimed.
     """
     rng, known = np.random.default_rng(3), scattered(16)
     variances = FIT_SIGMA**2 + 2.0 * COVARIANCE, 2.0 * COVARIANCE

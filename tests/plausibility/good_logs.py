@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 
 from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.io.overrides import Overrides, override
 from pathspace_graph.labels import LEFT
+from pathspace_graph.settings.checked import Overrides, override
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
 from pathspace_graph.sim.simulate import preset, simulate
 from pathspace_graph.sim.track_generator import generate_track

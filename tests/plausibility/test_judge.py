@@ -12,9 +12,9 @@ import pytest
 from pathspace_graph.factors.noise import MeasuredNoise, RayNoise
 from pathspace_graph.front_end.measurement import twist_noise
 from pathspace_graph.io.log import Detections, Log, Odometry, SensorInfo
-from pathspace_graph.io.overrides import override
 from pathspace_graph.labels import KINDS, LEFT, RIGHT, UNKNOWN, Kind
 from pathspace_graph.plausibility.judge import hints, is_line, objections, positions_in_metres
+from pathspace_graph.settings.checked import override
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import preset, simulate
 from pathspace_graph.sim.track_generator import generate_track

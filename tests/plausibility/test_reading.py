@@ -15,7 +15,7 @@ from pathspace_graph.errors import InputError
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.plausibility.judge import read_plausible_log, refused_hints
-from pathspace_graph.settings.online import LimitSettings
+from pathspace_graph.settings.mapper import LimitSettings
 
 from ..scenes.drives import short_drive
 from .mistakes import MISTAKES

@@ -21,10 +21,9 @@ from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import CalibrationSettings
+from pathspace_graph.settings.mapper import CalibrationSettings, MapperSettings
 from pathspace_graph.sim.vehicle import integrate
-from pathspace_graph.spline.knots import fit_spline
+from pathspace_graph.spline.bspline import fit_spline
 
 from .drives import DT, ahead, corridor, exact_log
 

@@ -154,10 +154,6 @@ def test_one_boundary_alone_is_given_without_a_centre_line() -> None:
     np.testing.assert_allclose(ahead.left, np.column_stack([np.arange(11.0), np.full(11, 2.0)]), atol=1e-9)
 
 
-def test_nothing_is_known_before_the_first_cycle() -> None:
-    assert FixedLagMapper().ahead(20.0).length == 0.0
-
-
 @pytest.mark.parametrize(
     ("distance", "step", "message"),
     [

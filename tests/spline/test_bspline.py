@@ -181,14 +181,6 @@ def test_arc_length_is_that_of_a_fine_polygon_and_its_inverse_is_one(spline: BSp
     )
 
 
-def test_other_points_on_the_same_basis() -> None:
-    spline = ring()
-    moved = spline.with_points(spline.distinct_control_points + 1.0)
-    assert moved.tables is spline.tables
-    u = inside(spline)
-    np.testing.assert_allclose(moved.evaluate(u), spline.evaluate(u) + 1.0, atol=1e-12)
-
-
 GOOD = uniform_knots(6, 3)
 POINTS = np.stack([np.arange(6.0), np.zeros(6)], axis=1)
 

@@ -284,18 +284,6 @@ def test_normals_up_to_ten_points_apart_must_not_meet(apart: int, left: list[flo
     np.testing.assert_array_equal(shortened[1:-1], 0.1)
 
 
-@pytest.mark.filterwarnings("ignore:Arrays of 2-dimensional vectors")
-def test_planners_of_tum_find_no_crossing_normals() -> None:
-    helpers = pytest.importorskip("trajectory_planning_helpers")
-    for seed in range(4):
-        left, right = rough(seed, True)
-        line = centre_line(left, right, None, 1.0)
-        track = np.column_stack([line.points, line.width_right, line.width_left])
-        path = np.concatenate([line.points, line.points[:1]])
-        normal = helpers.calc_splines.calc_splines(path)[3]
-        assert not helpers.check_normals_crossing.check_normals_crossing(track, normal)
-
-
 def test_what_has_no_centre_line() -> None:
     with pytest.raises(SettingsError, match="the left boundary to the left of the right one"):
         centre_line(circle(22.0), circle(18.0), None, 1.0)

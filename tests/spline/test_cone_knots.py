@@ -7,9 +7,9 @@ import pytest
 
 from pathspace_graph.eval.metrics.accuracy import closest_points
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import (
+from pathspace_graph.spline.bspline import (
     ENERGY_WEIGHT,
+    BSpline,
     chosen_breaks,
     energy_rows,
     fewest_breaks,
@@ -73,10 +73,6 @@ def test_knots_go_where_the_curve_bends() -> None:
     inside = np.abs(chosen.breaks - middle) < 10.0
     assert inside.mean() > 0.5
     assert 20.0 / along(points)[-1] < 0.2
-
-
-def distances(spline: BSpline, points: Array) -> Array:
-    return closest_points(spline, points).distance
 
 
 def test_a_smaller_curve_is_taken_where_it_foretells_better() -> None:

@@ -7,8 +7,7 @@ import pytest
 
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import SAMPLED_WEIGHT, LeastSquares, fit_spline
+from pathspace_graph.spline.bspline import SAMPLED_WEIGHT, BSpline, LeastSquares, fit_spline
 
 
 def ring(m: int, seed: int = 0) -> BSpline:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.settings.output import SpeedSettings
+from pathspace_graph.settings.mapper import SpeedSettings
 from pathspace_graph.spline.planning import speed_profile
 
 Array = NDArray[np.float64]

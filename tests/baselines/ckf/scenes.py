@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.ckf_belief import HEAD, Belief
-from pathspace_graph.baselines.ckf_curves import CurveState
+from pathspace_graph.baselines.ckf import HEAD, Belief, CurveState
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
-from pathspace_graph.spline.knots import fit_spline
+from pathspace_graph.spline.bspline import fit_spline
 
 Array = NDArray[np.float64]
 IntArray = NDArray[np.intp]

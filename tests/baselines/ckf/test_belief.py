@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pathspace_graph.baselines.ckf_belief import HEAD, Belief, point_columns, to_map_rows
+from pathspace_graph.baselines.ckf import HEAD, Belief, point_columns, to_map_rows
 from pathspace_graph.factors.odometry import IntegratedOdometry, integrate_twists
 from pathspace_graph.factors.se2 import compose
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.ckf_curves import CurveState
+from pathspace_graph.baselines.ckf import CurveState
 from pathspace_graph.baselines.filters import (
     SIGMA_ALONG,
     SIGMA_TIE,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.ckf_belief import square_root, transform
+from pathspace_graph.baselines.ckf import square_root, transform
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines import ckf_curves as expansion
-from pathspace_graph.baselines.ckf_belief import Belief
-from pathspace_graph.baselines.ckf_curves import CurveState, Expansion, beyond_end, proximity_chain
+from pathspace_graph.baselines import ckf as expansion
+from pathspace_graph.baselines.ckf import Belief, CurveState, Expansion, beyond_end, proximity_chain
 from pathspace_graph.baselines.filters import FILTER_REACH
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.path import CARRIED_TO, DrivenPath, PathAhead

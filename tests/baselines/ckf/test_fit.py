@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines import ckf_curves
-from pathspace_graph.baselines.ckf_curves import fit_detections
+from pathspace_graph.baselines import ckf
+from pathspace_graph.baselines.ckf import fit_detections
 from pathspace_graph.spline.bspline import BSpline
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ def points_beside(spline: BSpline, u: Array, offset: float) -> Array:
 
 def test_the_fit_minimizes_the_cost_of_its_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     """The gradient of |y - B C|^2 + (C - C_mu)' L (C - C_mu) is zero, with the paper's L."""
-    monkeypatch.setattr(ckf_curves, "RIDGE", 0.2)
+    monkeypatch.setattr(ckf, "RIDGE", 0.2)
     spline = curve()
     u = np.array([9.0, 14.0, 15.5])
     basis, known = spline.basis_matrix(u), spline.control_points

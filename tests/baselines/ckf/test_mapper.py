@@ -9,7 +9,7 @@ import pytest
 
 from pathspace_graph.baselines.filters import CkfMapper
 from pathspace_graph.estimators import make_online
-from pathspace_graph.eval.metrics.accuracy import cone_distances, lap_metrics
+from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
@@ -18,7 +18,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 
-from ...scenes.drives import ahead, bean_track, corridor, exact_log, lap_log
+from ...scenes.drives import ahead, corridor, exact_log
 
 
 def test_a_straight_drive_is_mapped_straight() -> None:
@@ -32,18 +32,6 @@ def test_a_straight_drive_is_mapped_straight() -> None:
         points = boundary.spline.evaluate(np.linspace(*boundary.spline.domain, 200))
         assert points[-1, 0] > 55.0
         assert np.abs(points[:, 1] - y).max() < 0.1
-
-
-@pytest.mark.slow
-def test_an_exact_lap_closes_both_curves() -> None:
-    log = lap_log(bean_track(), overrun=60.0)
-    mapper = CkfMapper(odometry_sigma=log.odometry_sigma)
-    result = run_online(log, mapper, name="ckf")
-    assert result.map.closed
-    assert log.truth is not None
-    assert cone_distances(result.map, log.truth).max() < 0.6
-    sizes = [boundary.size for boundary in result.map.boundaries.values()]
-    assert sum(sizes) < 0.6 * len(log.truth.cones)
 
 
 @pytest.mark.slow

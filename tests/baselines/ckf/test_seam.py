@@ -16,8 +16,7 @@ from pathspace_graph.baselines.filters import (
 )
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
-from pathspace_graph.spline.bspline import BSpline
-from pathspace_graph.spline.knots import fit_spline
+from pathspace_graph.spline.bspline import BSpline, fit_spline
 
 from ...scenes.maps import boundary_through
 

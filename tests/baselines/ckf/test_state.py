@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.baselines.ckf_belief import HEAD, Belief
-from pathspace_graph.baselines.ckf_curves import SIGMA_START, CurveState
+from pathspace_graph.baselines.ckf import HEAD, SIGMA_START, Belief, CurveState
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.settings.mapper import CkfSettings, MapperSettings
 from pathspace_graph.spline.bspline import BSpline
@@ -74,14 +73,6 @@ def test_the_prior_of_little_bending_bounds_extensions_without_detections_betwee
 
     assert largest(CkfSettings()) < 10.0
     assert largest(UNBENT) > 100.0
-
-
-def test_an_extension_of_one_curve_leaves_the_other_as_it_was() -> None:
-    state = straight_rows()
-    right = state.spline(RIGHT)
-    state.extend(LEFT, np.array([18.0, 2.0]), COVARIANCE)
-    np.testing.assert_allclose(state.spline(RIGHT).control_points, right.control_points, atol=1e-6)
-    assert (state.spline(LEFT).control_points[:, 1] > 1.0).all()
 
 
 def test_a_replaced_curve_has_the_transformed_points_and_covariance() -> None:

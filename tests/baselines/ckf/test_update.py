@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines import ckf_curves
-from pathspace_graph.baselines.ckf_belief import to_vehicle_rows
-from pathspace_graph.baselines.ckf_curves import RIDGE, SIGMA_ALONG, classify, on_curve, update
+from pathspace_graph.baselines import ckf
+from pathspace_graph.baselines.ckf import RIDGE, SIGMA_ALONG, classify, on_curve, to_vehicle_rows, update
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 
 from .scenes import COVARIANCE, bend, detections_of, straight_rows
@@ -83,7 +82,7 @@ def test_the_ridge_makes_no_difference_to_the_update(monkeypatch: pytest.MonkeyP
     """Both sides of the innovation go through one full-rank gain, which cancels."""
     results = []
     for ridge in (RIDGE, 2.0):
-        monkeypatch.setattr(ckf_curves, "RIDGE", ridge)
+        monkeypatch.setattr(ckf, "RIDGE", ridge)
         state = bend()
         detections = detections_of(POINTS)
         update(state, detections, classify(state, detections))
@@ -99,8 +98,8 @@ def test_both_curves_update_the_pose_together() -> None:
     detections = detections_of(points, np.array([LEFT, LEFT, RIGHT, RIGHT]))
     state.belief.covariance[1, 1] += 1.0
     update(state, detections, classify(state, detections))
-    assert -0.2 < state.pose[1] < -0.1
-    seen = to_vehicle_rows(state.pose[None], state.control_points(RIGHT).reshape(1, -1))[0, 1::2]
+    assert -0.2 < state.belief.pose[1] < -0.1
+    seen = to_vehicle_rows(state.belief.pose[None], state.control_points(RIGHT).reshape(1, -1))[0, 1::2]
     assert np.abs(seen + 1.8).max() < 0.1
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_map import (
+from pathspace_graph.baselines.landmarks import (
     LandmarkMap,
     LandmarkSmoother,
     LandmarkState,
@@ -21,8 +21,7 @@ from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.mapping.motion import smoother_settings
-from pathspace_graph.settings.mapper import GateSettings, MapperSettings
-from pathspace_graph.settings.online import CalibrationSettings
+from pathspace_graph.settings.mapper import CalibrationSettings, GateSettings, MapperSettings
 
 from ...scenes.drives import ODOMETRY_SIGMA, beginning, see
 

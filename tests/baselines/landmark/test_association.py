@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,9 +11,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_association import (
+from pathspace_graph.baselines.landmarks import (
+    AMBIGUOUS,
     CREATE_GATE,
     MATCH_GATE,
+    UNASSOCIATED,
     assign,
     associate_created,
     associate_newest,
@@ -21,11 +25,10 @@ from pathspace_graph.baselines.landmark_association import (
     predicted_points,
     squared_mahalanobis,
 )
-from pathspace_graph.baselines.landmark_map import AMBIGUOUS, UNASSOCIATED
 from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.graph.variables import pose_key
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.settings.mapper import GrowthSettings
 
 from ...scenes.drives import detections
 from .scenes import SPEED, drive_on, driven, with_covariance
@@ -37,17 +40,6 @@ def test_gates_are_those_of_two_degrees_of_freedom() -> None:
     """`P(d^2 < x) = 1 - exp(-x / 2)`."""
     assert pytest.approx(-2.0 * np.log(0.05)) == MATCH_GATE
     assert pytest.approx(-2.0 * np.log(0.01)) == CREATE_GATE
-
-
-def test_the_assignment_is_the_best_of_all_not_that_of_each_detection() -> None:
-    cost = np.array([[1.0, 2.0], [1.5, 5.5]])  # greedy would take 1.0 and leave 5.5
-    np.testing.assert_array_equal(assign(cost)[0], [1, 0])
-
-
-def test_a_bad_pair_is_not_taken_to_save_another() -> None:
-    cost = np.array([[0.5, 50.0], [0.1, 50.0]])
-    landmark, _ = assign(cost)
-    np.testing.assert_array_equal(landmark, [UNASSOCIATED, 0])
 
 
 def test_a_detection_between_the_gates_is_neither_associated_nor_new() -> None:
@@ -64,13 +56,17 @@ def test_there_pairs_no_detections_or_no_landmarks(shape: tuple[int, int]) -> No
     assert is_new.all()
 
 
-@given(arrays(float, (4, 5), elements=st.floats(0.0, 20.0) | st.just(np.inf)))
-def test_it_is_one_to_one_and_inside_the_gate(cost: Array) -> None:
+@given(arrays(float, (3, 4), elements=st.floats(0.0, 20.0) | st.just(np.inf)))
+def test_it_is_the_best_of_all_one_to_one_and_inside_the_gate(cost: Array) -> None:
     landmark, is_new = assign(cost)
     matched = np.flatnonzero(landmark != UNASSOCIATED)
     assert len(np.unique(landmark[matched])) == len(matched)
     assert (cost[matched, landmark[matched]] < MATCH_GATE).all()
     assert not is_new[matched].any()
+    capped = np.minimum(cost, MATCH_GATE)
+    best = min(capped[range(3), list(columns)].sum() for columns in permutations(range(4), 3))
+    found = cost[matched, landmark[matched]].sum() + MATCH_GATE * (3 - len(matched))
+    assert found == pytest.approx(best)
 
 
 def test_an_unknown_label_is_compatible_with_both() -> None:

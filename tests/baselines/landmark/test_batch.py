@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from pathspace_graph.baselines import landmark_batch
-from pathspace_graph.baselines.landmark_batch import LandmarkBatch
-from pathspace_graph.baselines.landmark_map import LandmarkSystem
+from pathspace_graph.baselines import landmark_graph
+from pathspace_graph.baselines.landmark_graph import LandmarkBatch
+from pathspace_graph.baselines.landmarks import LandmarkSystem
 from pathspace_graph.eval.metrics.reference import solve_oracle_landmarks
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import PointBoundary
@@ -22,14 +22,14 @@ from ...scenes.drives import ahead, exact_log, true_poses
 def test_it_finds_the_landmarks_of_the_oracle(bean: Log, monkeypatch: pytest.MonkeyPatch) -> None:
     """And it associates anew until hardly any detection changes."""
     assert bean.truth is not None
-    real, changed = landmark_batch.reassociate, list[float]()
+    real, changed = landmark_graph.reassociate, list[float]()
 
     def reassociate(system: LandmarkSystem, *others: Any) -> None:
         before = system.detections.landmark.copy()
         real(system, *others)
         changed.append(float(np.mean(before != system.detections.landmark)))
 
-    monkeypatch.setattr(landmark_batch, "reassociate", reassociate)
+    monkeypatch.setattr(landmark_graph, "reassociate", reassociate)
     result = LandmarkBatch(odometry_sigma=bean.odometry_sigma).solve(bean)
     assert changed[-1] <= 1e-3 < changed[0]
     _, oracle = solve_oracle_landmarks(bean)

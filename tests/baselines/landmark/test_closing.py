@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_fixed_lag import (
+from pathspace_graph.baselines.landmark_graph import (
     JointCompatibility,
     detect_loop,
 )

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
+from pathspace_graph.baselines.landmark_graph import LandmarkFixedLag
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.eval.metrics.trajectory import position_rms, trajectory_errors
@@ -18,8 +18,7 @@ from pathspace_graph.io.log import Detections, Log
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.run import run_online, split_odometry
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import SidesSettings
+from pathspace_graph.settings.mapper import MapperSettings, SidesSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 
 from ...scenes.drives import ahead, bean_track, corridor, exact_log, lap_log

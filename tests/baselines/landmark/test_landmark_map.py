@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_map import LandmarkState
+from pathspace_graph.baselines.landmarks import LandmarkState
 from pathspace_graph.labels import LEFT, RIGHT
 
 from ...scenes.digest import digest

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pathspace_graph.baselines.landmark_association import find_duplicates, merge
-from pathspace_graph.baselines.landmark_batch import remove_rare
-from pathspace_graph.baselines.landmark_map import LandmarkState
+from pathspace_graph.baselines.landmark_graph import remove_rare
+from pathspace_graph.baselines.landmarks import LandmarkState, find_duplicates, merge
 from pathspace_graph.graph.gaussian import normal_equations
 from pathspace_graph.graph.variables import Layout
 from pathspace_graph.io.log import Log

@@ -8,7 +8,7 @@ import pytest
 from gtsam.symbol_shorthand import C, L, X
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_map import UNASSOCIATED, LandmarkSystem, solve_landmarks, start_oracle
+from pathspace_graph.baselines.landmarks import LandmarkSystem, solve_landmarks, start_oracle
 from pathspace_graph.factors.gtsam_factors import calibrated_odometry_factor
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.io.log import Log
@@ -31,16 +31,6 @@ def test_the_cost_falls_along_the_gradient_of_the_rows(bean: Log) -> None:
         variables.values = at + sign * step
         costs.append(system.cost(state))
     assert costs[0] - costs[1] == pytest.approx(-2.0 * vector @ step, rel=1e-4)
-
-
-def test_a_system_of_a_log_has_no_association_and_costs_nothing_at_dead_reckoning() -> None:
-    log = exact_log(ahead(5.0, 1.0), np.array([[8.0, 2.0]]), np.array([LEFT]))
-    system = LandmarkSystem.of_log(log, MapperSettings(), log.noise)
-    assert len(system.detections) == len(log.cycles)
-    assert (system.detections.landmark == UNASSOCIATED).all()
-    state = start_oracle(system, system.detections.landmark)
-    assert len(state) == 0
-    assert system.cost(state) == pytest.approx(0.0, abs=1e-18)
 
 
 def test_the_oracle_starts_each_landmark_at_its_first_detection_with_its_most_frequent_label() -> None:

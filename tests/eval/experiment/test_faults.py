@@ -26,7 +26,7 @@ from pathspace_graph.eval.experiment.faults import (
     write_suite,
 )
 from pathspace_graph.eval.experiment.study import Study
-from pathspace_graph.io.overrides import leaves
+from pathspace_graph.settings.checked import leaves
 from pathspace_graph.sim.faults import Faults
 from pathspace_graph.sim.simulate import SimulationSettings
 

@@ -24,8 +24,8 @@ from pathspace_graph.eval.experiment.run import run_study
 from pathspace_graph.eval.experiment.study import Study, read_study_file
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import PointBoundary, read_map
-from pathspace_graph.io.overrides import leaves
 from pathspace_graph.run import split_odometry
+from pathspace_graph.settings.checked import leaves
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ...scenes.drives import noisy_lap
@@ -98,7 +98,7 @@ def study(tmp_path: Path, **of: Any) -> Study:
 def test_the_code_of_an_estimator_has_what_it_imports_and_no_other_estimator() -> None:
     code = code_of("ckf")
     ours = {name.removeprefix("pathspace_graph.") for name in code}
-    assert {"baselines.filters", "baselines.ckf_curves", "factors._kernels", "run", "sim.simulate"} <= ours
+    assert {"baselines.filters", "baselines.ckf", "factors._kernels", "run", "sim.simulate"} <= ours
     assert {"eval.metrics.measures", "settings.mapper", "gtsam", "numpy", "scipy"} <= ours
     assert not {"online.fixed_lag", "pandas", "sim.track_files"} & ours
     assert "online.fixed_lag" in {name.removeprefix("pathspace_graph.") for name in code_of("fixed-lag")}

@@ -27,7 +27,7 @@ from pathspace_graph.eval.experiment.study import (
     track_digest,
 )
 from pathspace_graph.eval.metrics.summary import lap_times
-from pathspace_graph.io.overrides import leaves, override
+from pathspace_graph.settings.checked import leaves, override
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import CAMERA, CAMERA_FAULTS, INS, INS_RATE, SimulationSettings, simulate
 from pathspace_graph.sim.track_files import read_track

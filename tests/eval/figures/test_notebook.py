@@ -21,8 +21,7 @@ from pathspace_graph.eval.metrics.summary import lap_times, summarize
 from pathspace_graph.health import DEGRADED
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.plausibility.judge import Hint
-from pathspace_graph.settings.mapper import SplineSettings
-from pathspace_graph.settings.online import GrowthSettings
+from pathspace_graph.settings.mapper import GrowthSettings, SplineSettings
 
 from ...scenes.drives import noisy_lap, short_drive
 

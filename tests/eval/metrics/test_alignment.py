@@ -27,7 +27,7 @@ from pathspace_graph.sim.sensor import SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.sim.vehicle import VehicleSettings
-from pathspace_graph.spline.knots import fit_spline
+from pathspace_graph.spline.bspline import fit_spline
 
 from ...scenes.drives import bean_track
 from ...scenes.maps import boundary, circle, ring_map

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_map import solve_landmarks
+from pathspace_graph.baselines.landmarks import solve_landmarks
 from pathspace_graph.eval.metrics.accuracy import root_mean_square
 from pathspace_graph.eval.metrics.reference import (
     landmark_rmse,
@@ -23,8 +23,7 @@ from pathspace_graph.eval.metrics.trajectory import position_rms, trajectory_err
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.labels import LEFT, UNKNOWN
-from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.settings.online import CalibrationSettings, OdometrySettings
+from pathspace_graph.settings.mapper import CalibrationSettings, MapperSettings, OdometrySettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate

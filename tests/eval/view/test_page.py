@@ -176,8 +176,7 @@ def test_a_folder_that_is_no_result_is_named(
 def test_without_bokeh_the_extra_is_named(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in ("commands.view", "eval.view.page"):
-        monkeypatch.delitem(sys.modules, f"pathspace_graph.{name}", raising=False)
+    monkeypatch.delitem(sys.modules, "pathspace_graph.eval.view.page", raising=False)
     for name in [name for name in sys.modules if name.partition(".")[0] == "bokeh"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "bokeh", None)

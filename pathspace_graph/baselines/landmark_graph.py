@@ -1,61 +1,63 @@
-"""The Hungarian landmark graph online: cones are points in the same fixed-lag smoother as the curves.
+"""The Hungarian landmark graph: cones are points in the same fixed-lag smoother as the curves, or in a batch.
 
 The loop closes when enough of the recent landmarks are landmarks of the beginning. Their joint covariance
 tests a set of pairs as a whole (joint compatibility, Neira and Tardos 2001).
 """
 
+from dataclasses import replace
+from itertools import pairwise
 from typing import ClassVar, Final
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from pathspace_graph.batch.association import insert_drive
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.residuals import chi2_quantile
+from pathspace_graph.factors.noise import KnownNoise
+from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
 from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.graph.elimination import Elimination
 from pathspace_graph.graph.smoother import FixedLagSmoother, restart, set_prior
-from pathspace_graph.graph.variables import ONE_DRIVE, POINT
+from pathspace_graph.graph.variables import ONE_DRIVE, POINT, POSE
+from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import Map
-from pathspace_graph.io.results import VehicleState
+from pathspace_graph.io.results import BatchRun, VehicleState
 from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.laps import LapCounter
 from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.mapping import motion as motions
-from pathspace_graph.mapping.motion import predict, vehicle_state
+from pathspace_graph.mapping.motion import known_noise, predict, vehicle_state
 from pathspace_graph.mapping.path import DrivenPath
 from pathspace_graph.mapping.tracks import FORGET_AFTER, Tracks, nearest_within
-from pathspace_graph.run import CycleResult, Readings, Stopwatch
+from pathspace_graph.run import CycleResult, Readings, Stopwatch, settings_dict, solved, split_odometry
+from pathspace_graph.settings.mapper import MapperSettings, known_settings
 
-from . import landmark_association as association
-from .landmark_association import CREATE, MATCH_GATE, difference_covariances
-from .landmark_map import (
-    SIGMA_MERGE,
-    UNASSOCIATED,
-    LandmarkDetections,
-    LandmarkMap,
-    LandmarkSmoother,
-    LandmarkState,
-    LandmarkSystem,
-    landmark_counts,
-    point_map,
-)
-from .online import FRONT_END, OnlineBaseline
+from . import landmarks
 
-UNSEEN_PATH: Final = 40.0  # path without a detection after which a landmark is old (m)
-PRIOR_SCALE: Final = 1.5  # factor of the sigmas of the vehicle and the landmarks, which are too certain
 MIN_PAIRS: Final = 4  # least number of pairs that close the loop, a third of them of each colour
-MIN_LEAD: Final = 2.0  # least lead of the score over any other set of pairs, in gates
 
 
-class LandmarkFixedLag(OnlineBaseline):
+class LandmarkFixedLag(landmarks.OnlineBaseline):
     """Maps cones as points: predict, associate, create, update, close, marginalize.
 
     Window, odometry and robust weights are those of `FixedLagMapper`; each detection has a landmark instead
     of a curve.
     """
 
-    READS: ClassVar = (*FRONT_END, "lag", "max_poses", "open_lap", "relinearize", "steps", "steps_grown")
+    READS: ClassVar = (
+        *landmarks.FRONT_END,
+        "lag",
+        "max_poses",
+        "open_lap",
+        "relinearize",
+        "steps",
+        "steps_grown",
+    )
 
     def _begin(self) -> None:
-        self.smoother = FixedLagSmoother(motions.smoother_settings(self.settings), LandmarkMap(self.settings))
+        self.smoother = FixedLagSmoother(
+            motions.smoother_settings(self.settings), landmarks.LandmarkMap(self.settings)
+        )
         self.smoother.window.exact = True
         self.path = DrivenPath()
         growth = self.settings.growth
@@ -81,7 +83,7 @@ class LandmarkFixedLag(OnlineBaseline):
         eligible = np.ones(len(state), bool)
         if not self.closed and self._near_start():  # a single detection of an old landmark is ambiguous
             eligible = ~self._old()
-        association.associate_newest(smoother, new, eligible)
+        landmarks.associate_newest(smoother, new, eligible)
         watch.lap("associate")
         created = self._create(new, detections.t)
         watch.lap("create")
@@ -102,7 +104,7 @@ class LandmarkFixedLag(OnlineBaseline):
             self._left.append((poses[:left].copy(), landmark[cycle < smoother.first_cycle].copy()))
         watch.lap("marginalize")
         used = int((table.used & (table.cycle == smoother.next_cycle - 1)).sum())
-        pose, sizes = smoother.variables.poses[-1].copy(), landmark_counts(state.labels)
+        pose, sizes = smoother.variables.poses[-1].copy(), landmarks.landmark_counts(state.labels)
         return CycleResult(detections.t, pose, sizes, used, self.closed, watch.laps)
 
     def _create(self, new: slice, t: float) -> bool:
@@ -113,7 +115,7 @@ class LandmarkFixedLag(OnlineBaseline):
             self.smoother.variables,
         )
         created, tentative, growth = False, self.tentative, self.settings.growth
-        rows = new.start + np.flatnonzero(detections.landmark[new] == UNASSOCIATED)
+        rows = new.start + np.flatnonzero(detections.landmark[new] == landmarks.UNASSOCIATED)
         covariances = detections.covariances_map(rows, variables)
         tentative.add(detections.points_map(rows, variables), covariances, detections.label[rows], t)
         for label in BOUNDARIES:
@@ -121,11 +123,11 @@ class LandmarkFixedLag(OnlineBaseline):
             if len(confirmed) == 0:
                 continue
             points = tentative.points[confirmed].copy()
-            rows = np.flatnonzero((detections.label == label) & (detections.landmark == UNASSOCIATED))
-            points_map = detections.points_map(rows, variables)
-            chosen, landmark = association.associate_created(
-                points_map, detections.cycle[rows], points, growth
+            rows = np.flatnonzero(
+                (detections.label == label) & (detections.landmark == landmarks.UNASSOCIATED)
             )
+            points_map = detections.points_map(rows, variables)
+            chosen, landmark = landmarks.associate_created(points_map, detections.cycle[rows], points, growth)
             held, landmark = np.unique(landmark, return_inverse=True)
             numbers = state.add(points[held], np.full(len(held), label, np.intp))[landmark]
             detections.take(rows[chosen], numbers)
@@ -139,15 +141,15 @@ class LandmarkFixedLag(OnlineBaseline):
 
     def _old(self) -> BoolArray:
         last_detected = self._last_detected[self.smoother.map.state.numbers]
-        return np.asarray(last_detected < self.path.length - UNSEEN_PATH)
+        return np.asarray(last_detected < self.path.length - 40.0)  # m driven without a detection
 
-    def whole_drive(self, detections: LandmarkDetections) -> LandmarkState:
+    def whole_drive(self, detections: landmarks.LandmarkDetections) -> landmarks.LandmarkState:
         """Associate the detections of all cycles, and return the map with all poses.
 
         Each association and pose is as of its end in the window.
         """
         track, variables = self.smoother.map, self.smoother.variables
-        state, final = LandmarkState(), np.arange(track.state.next_number)
+        state, final = landmarks.LandmarkState(), np.arange(track.state.next_number)
         for gone, kept in sorted(track.merged_into.items()):  # ascending, so that `kept` is already final
             final[gone] = final[kept]
         landmark = np.concatenate([*(landmark for _, landmark in self._left), track.detections.landmark])
@@ -171,7 +173,7 @@ class LandmarkFixedLag(OnlineBaseline):
         self._last_check = length
         if self.closed:
             self._merge(
-                *association.find_duplicates(state, len(state), self.smoother.last_covariance, self.settings)
+                *landmarks.find_duplicates(state, len(state), self.smoother.last_covariance, self.settings)
             )
         elif self._near_start() and self.record.unsolvable is None:
             reach = self.settings.closing.radius_after(length)
@@ -186,8 +188,8 @@ class LandmarkFixedLag(OnlineBaseline):
         """Replace the map by the optimum of the whole drive, and the prior by its marginal."""
         smoother, first, noise = self.smoother, self.smoother.first_cycle, self.front_end.noise_used
         drive = self.record.lap(first, None, (), self.inflated, reading.noise)
-        detections = LandmarkDetections.of_drives([drive.detections], ONE_DRIVE)
-        system = LandmarkSystem(detections, drive.chain, self.inflated, noise)
+        detections = landmarks.LandmarkDetections.of_drives([drive.detections], ONE_DRIVE)
+        system = landmarks.LandmarkSystem(detections, drive.chain, self.inflated, noise)
         solved = self.whole_drive(detections)
         system.optimize(solved)
         restart(smoother, first)
@@ -201,14 +203,14 @@ class LandmarkFixedLag(OnlineBaseline):
         if len(gone):
             numbers = self.smoother.map.state.numbers
             np.maximum.at(self._last_detected, numbers[kept], self._last_detected[numbers[gone]])
-            association.merge(self.smoother, gone, kept)
+            landmarks.merge(self.smoother, gone, kept)
 
     def _map(self, with_covariance: bool) -> Map:
         state = self.smoother.map.state
         if with_covariance and len(state):
             joint = self.smoother.last_covariance(state.keys)
-            return point_map(state.landmarks, state.labels, joint, self.closed)
-        return point_map(state.landmarks, state.labels, None, self.closed)
+            return landmarks.point_map(state.landmarks, state.labels, joint, self.closed)
+        return landmarks.point_map(state.landmarks, state.labels, None, self.closed)
 
     def window_poses(self) -> Array:
         return self.smoother.variables.poses.copy()
@@ -229,7 +231,9 @@ class LandmarkFixedLag(OnlineBaseline):
 class JointCompatibility:
     """Test of sets of pairs by the joint Gaussian of recent and old landmarks, all sigmas times `scale`."""
 
-    def __init__(self, smoother: LandmarkSmoother, recent: IntArray, old: IntArray, scale: float) -> None:
+    def __init__(
+        self, smoother: landmarks.LandmarkSmoother, recent: IntArray, old: IntArray, scale: float
+    ) -> None:
         state = smoother.map.state
         self.recent, self.old = recent, old
         both = np.concatenate([recent, old])
@@ -240,15 +244,15 @@ class JointCompatibility:
     def distances(self, mean: Array, covariance: Array) -> Array:
         """Squared Mahalanobis distances (k, n) of all pairs, infinite for different labels."""
         k = len(self.recent)
-        spread = difference_covariances(covariance, np.arange(k)[:, None], np.arange(k, len(mean)))
-        squared = association.squared_mahalanobis(mean[:k, None] - mean[None, k:], spread)
+        spread = landmarks.difference_covariances(covariance, np.arange(k)[:, None], np.arange(k, len(mean)))
+        squared = landmarks.squared_mahalanobis(mean[:k, None] - mean[None, k:], spread)
         return np.where(self.same_label, squared, np.inf)
 
     def conditioned(self, mean: Array, covariance: Array, i: int, j: int) -> tuple[Array, Array]:
         """Condition the Gaussian on recent landmark i being old landmark j, by a Kalman update."""
         a, b = POINT * i, POINT * (len(self.recent) + j)
         cross = covariance[:, a : a + POINT] - covariance[:, b : b + POINT]
-        spread = cross[a : a + POINT] - cross[b : b + POINT] + SIGMA_MERGE**2 * np.eye(POINT)
+        spread = cross[a : a + POINT] - cross[b : b + POINT] + landmarks.SIGMA_MERGE**2 * np.eye(POINT)
         gain = np.linalg.solve(spread, cross.T).T
         innovation = mean[i] - mean[len(self.recent) + j]
         return mean - (gain @ innovation).reshape(-1, POINT), covariance - gain @ cross.T
@@ -270,7 +274,7 @@ class JointCompatibility:
 
 
 def detect_loop(
-    smoother: LandmarkSmoother, recent: IntArray, old: IntArray, reach: float
+    smoother: landmarks.LandmarkSmoother, recent: IntArray, old: IntArray, reach: float
 ) -> tuple[IntArray, IntArray] | None:
     """Find pairs (k,) of recent and old landmarks, within `reach` (m), of one cone each.
 
@@ -281,8 +285,8 @@ def detect_loop(
     old = old[nearest_within(state.landmarks[old], state.landmarks[recent], reach)[1]]
     if len(recent) < MIN_PAIRS or len(old) < MIN_PAIRS:
         return None
-    gate = MATCH_GATE
-    test = JointCompatibility(smoother, recent, old, PRIOR_SCALE)
+    gate = landmarks.MATCH_GATE
+    test = JointCompatibility(smoother, recent, old, 1.5)  # vehicle and landmarks are too certain
     seeds = np.argwhere(test.distances(test.mean, test.covariance) < gate)
     if len(seeds) == 0:
         return None
@@ -290,10 +294,147 @@ def detect_loop(
     scores = [len(pairs) * gate - distance for pairs, distance in hypotheses]
     pairs, distance = hypotheses[int(np.argmax(scores))]
     others = [s for s, (other, _) in zip(scores, hypotheses, strict=True) if set(other).isdisjoint(pairs)]
-    if max(scores) - max(others, default=0.0) < MIN_LEAD * gate:
+    if max(scores) - max(others, default=0.0) < 2.0 * gate:  # by two pairs
         return None
     i, j = np.array(pairs, np.intp).T
     labels = state.labels[recent[i]]
     enough = all((labels == label).sum() >= MIN_PAIRS // 3 for label in BOUNDARIES)
-    fits = distance < chi2_quantile(CREATE, POINT * len(labels))
+    fits = distance < chi2_quantile(landmarks.CREATE, POINT * len(labels))
     return (recent[i], old[j]) if enough and len(labels) >= MIN_PAIRS and fits else None
+
+
+# --- the Hungarian landmark graph over a whole log: all poses and landmarks, with iterated associations -
+
+
+class LandmarkBatch:
+    """Maps cones as points with all poses of a log, from the online run of `LandmarkFixedLag` on."""
+
+    READS: ClassVar = LandmarkFixedLag.READS
+
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
+        self.settings = known_settings(settings)
+        self.odometry_sigma = odometry_sigma
+        known_noise(odometry_sigma)  # check it early
+
+    def solve(self, log: Log) -> BatchRun:
+        return solved(self._solve, log)
+
+    def _solve(self, log: Log) -> BatchRun:
+        """Optimize the map of the online run, and associate anew until hardly any detection changes."""
+        noise = known_noise(self.odometry_sigma)
+        system = landmarks.LandmarkSystem.of_log(log, self.settings, noise)
+        online = LandmarkFixedLag(system.settings, noise)
+        for odometry, cycle in split_odometry(log):
+            online.update(odometry, cycle)
+        detections, state = system.detections, online.whole_drive(system.detections)
+        sigma = np.array(online.inflated.odometry.sigmas)  # priors at the end of the online run
+        chain = replace(system.chain, calibration_sigma=sigma)
+        system = replace(system, settings=online.inflated, chain=chain)
+        system.optimize(state)
+        converged, rounds = False, 0
+        while not converged and rounds < 10:
+            before, known, problem = detections.landmark.copy(), len(state), system.eliminated(state)
+            reassociate(system, state, problem, self.settings)
+            gone, kept = landmarks.find_duplicates(state, known, problem.joint, self.settings)
+            detections.merge(state.numbers[gone], state.numbers[kept])
+            remove_rare(state, detections, self.settings.growth.sightings)
+            converged = int((before != detections.landmark).sum()) <= 1e-3 * len(detections)
+            system.optimize(state)
+            rounds += 1
+        laps, problem, poses = LapCounter(), system.eliminated(state), state.variables.poses.copy()
+        for pose in poses:
+            laps.update(pose)
+        return BatchRun(
+            estimator="landmark-batch",
+            settings=settings_dict(self.settings),
+            map=landmarks.point_map(
+                state.landmarks, state.labels, problem.joint(state.keys), laps.completed > 0
+            ),
+            trajectory_t=system.chain.stamps,
+            trajectory=poses,
+            cycles=(),
+            laps=laps.completed,
+            converged=converged,
+            noise=system.noise,
+        )
+
+
+def reassociate(
+    system: landmarks.LandmarkSystem,
+    state: landmarks.LandmarkState,
+    problem: Elimination,
+    settings: MapperSettings,
+) -> None:
+    """Assign the detections of every cycle once more, by the covariances of the eliminated problem.
+
+    Each landmark takes the label of most detections in its gate. Detections that no landmark explains create
+    landmarks, at tracks with enough of them.
+    """
+    detections, stamps, growth = system.detections, system.chain.stamps, settings.growth
+    points_map = detections.points_map(slice(None), state.variables)
+    pairs = KDTree(points_map).sparse_distance_matrix(
+        KDTree(state.landmarks), landmarks.ROUGH_GATE, output_type="coo_matrix"
+    )
+    order = np.argsort(pairs.row, kind="stable")
+    rows, nearby = pairs.row[order].astype(np.intp), pairs.col[order].astype(np.intp)
+    cycles = detections.cycle[rows]
+    poses = state.variables.poses_at(cycles)
+    r = landmark_residuals(poses, state.landmarks[nearby], detections.point[rows])
+    jacobian = np.concatenate([r.by_pose, r.by_landmark], axis=2)
+    spread = predicted_covariances(problem, cycles, state.keys[nearby], jacobian)
+    cost = landmarks.squared_mahalanobis(r.residual, spread + detections.covariance[rows])
+    held = detections.landmark[rows] == state.numbers[nearby]
+    cost = landmarks.hysteresis_costs(cost, held)
+    inside = cost < landmarks.MATCH_GATE
+    state.votes = np.zeros_like(state.votes)
+    state.vote(detections.label[rows[inside]], state.numbers[nearby[inside]])
+    detections.landmark[:] = landmarks.UNASSOCIATED
+    free = np.ones(len(detections), bool)
+    starts = np.searchsorted(cycles, np.arange(len(stamps) + 1))
+    for begin, end in pairwise(starts.tolist()):
+        detected, i = np.unique(rows[begin:end], return_inverse=True)
+        candidates, j = np.unique(nearby[begin:end], return_inverse=True)
+        table = np.full((len(detected), len(candidates)), np.inf)
+        table[i, j] = cost[begin:end]
+        same_label = landmarks.compatible(detections.label[detected], state.labels[candidates])
+        table[~same_label] = np.inf
+        landmark, free[detected] = landmarks.assign(table)
+        matched = landmark != landmarks.UNASSOCIATED
+        detections.take(detected[matched], state.numbers[candidates[landmark[matched]]])
+    # do not create landmarks that one with another label explains, or that would be merged
+    free[rows[inside | (pairs.data[order] < growth.merge_radius)]] = False
+    new = np.flatnonzero(free & ~detections.used)
+    covariances = detections.covariances_map(new, state.variables)
+    tracks = Tracks(growth.merge_radius, np.inf)
+    tracks.add(points_map[new], covariances, detections.label[new], stamps[detections.cycle[new]])
+    for label in BOUNDARIES:
+        rows = new[detections.label[new] == label]
+        points = tracks.points[tracks.confirmed(label, growth.sightings)]
+        chosen, landmark = landmarks.associate_created(
+            points_map[rows], detections.cycle[rows], points, growth
+        )
+        numbers = state.add(points, np.full(len(points), label, np.intp))
+        detections.take(rows[chosen], numbers[landmark])
+
+
+def predicted_covariances(problem: Elimination, cycles: IntArray, keys: IntArray, jacobian: Array) -> Array:
+    """Compute `J Sigma J'` (m, 2, 2), J (m, 2, 5) by [pose | landmark], for cycles (m,) and keys (m,)."""
+    landmark = problem.map.columns(keys)[:, None] + np.arange(POINT)
+    pose = POSE * cycles[:, None] + np.arange(POSE)
+    cross = problem.cross_covariance[pose[:, :, None], landmark[:, None, :]]
+    own = problem.map_covariance[landmark[:, :, None], landmark[:, None, :]]
+    joint = np.block([[problem.pose_marginals[cycles], cross], [np.swapaxes(cross, 1, 2), own]])
+    return np.asarray(jacobian @ joint @ np.swapaxes(jacobian, 1, 2))
+
+
+def remove_rare(
+    state: landmarks.LandmarkState, detections: landmarks.LandmarkDetections, fewest: int
+) -> None:
+    """Remove landmarks with fewer detections than `fewest`; their detections become unassociated."""
+    counts = np.bincount(state.positions(detections.landmark[detections.used]), minlength=len(state))
+    gone = counts < fewest
+    detections.landmark[np.isin(detections.landmark, state.numbers[gone])] = landmarks.UNASSOCIATED
+    state.variables.remove(state.keys[gone])
+    state.keep(~gone)

@@ -1,28 +1,227 @@
-"""The paper's state: pose and control points of clamped splines, growth and update (paper: Expansion)."""
+"""The paper's filter: a joint Gaussian over pose and curves, propagated by the cubature rule.
 
-from dataclasses import dataclass
+The paper's transform is the third-degree spherical-radial rule (Arasaratnam and Haykin 2009). The state holds
+the pose and the control points of clamped splines (paper: Expansion).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, lapack
 
+from pathspace_graph.factors import se2
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import clamped_knots, scatter
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry
 from pathspace_graph.factors.residuals import greville, project, smoothness_matrix
-from pathspace_graph.factors.se2 import in_vehicle, path_lengths, rotated, rotation, to_map, to_vehicle
-from pathspace_graph.factors.sensor import SENSOR_SIZE
+from pathspace_graph.factors.sensor import SENSOR_SIZE, by_sensor, corrected
 from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.io.log import Detections
 from pathspace_graph.labels import BOUNDARIES, UNKNOWN
 from pathspace_graph.mapping import path
+from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.mapping.path import END_BEHIND, SIDES, Candidates, End, PathAhead, chain
 from pathspace_graph.mapping.tracks import FORGET_AFTER, Tracks, nearest_within
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary, relocate
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
-from .ckf_belief import SENSOR_COLUMNS, Belief, point_columns, to_vehicle_rows, transform
+_LEAST_VARIANCE: Final = 1e-12
+"""Least eigenvalue of a covariance without a Cholesky factor, relative to the largest one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transformed:
+    """Moments of a function of a Gaussian, by the cubature rule."""
+
+    mean: Array  # (q,) mean of the function
+    covariance: Array  # (q, q) covariance of the function
+    slope: Array
+    """(q, d) Statistical linearization `C_yx C_xx^-1`. The covariance of the function with a variable z that
+    it does not depend on is `slope @ C_xz`, exactly for Gaussians."""
+
+
+def square_root(covariance: Array) -> Array:
+    """Lower L with `L L' = covariance` (d, d); small eigenvalues of a singular covariance are raised."""
+    factor, info = lapack.dpotrf(covariance, lower=1, clean=1)
+    if info == 0:
+        return np.asarray(factor)
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    lifted = np.maximum(values, _LEAST_VARIANCE * max(float(values[-1]), _LEAST_VARIANCE))
+    return np.asarray(np.linalg.qr((vectors * np.sqrt(lifted)).T)[1].T)
+
+
+def transform(function: Callable[[Array], Array], mean: Array, covariance: Array) -> Transformed:
+    """Compute mean, covariance and slope of `function`, which maps points (k, d) row by row to (k, q).
+
+    Its 2 d points are `mean +- sqrt(d) L e_i`, of equal weight, where L is the root of the covariance. All
+    are exact for a linear function; the mean is exact for a polynomial of the third degree.
+    """
+    root = square_root(covariance)
+    d = len(mean)
+    offsets = np.sqrt(d) * root.T
+    values = function(np.concatenate([mean + offsets, mean - offsets]))
+    centre = values.mean(axis=0)
+    spread = (values - centre) / np.sqrt(2.0 * d)
+    half = (values[:d] - values[d:]) / (2.0 * np.sqrt(d))
+    slope, _ = lapack.dtrtrs(root, half, lower=1, trans=1)
+    return Transformed(centre, spread.T @ spread, np.asarray(slope).T)
+
+
+HEAD: Final = POSE + CALIBRATION_SIZE + SENSOR_SIZE  # number of entries of the state before its points
+SENSOR_COLUMNS: Final = np.arange(POSE + CALIBRATION_SIZE, HEAD)  # entries of the sensor's calibration
+
+
+class Belief:
+    """Gaussian over `x = [pose | calibration of odometry and sensor | points]`.
+
+    Pose (x, y, theta) and points (x, y) are in the map frame, in m and rad. The calibration is the scale
+    error of the speeds, the bias of the yaw rate (rad/s), and `factors.sensor:SENSOR`. Only the entries of x
+    that a model depends on get cubature points. The others follow by the joint covariance. The result is that
+    of the full rule, without its cubic cost.
+    """
+
+    def __init__(self, pose: Array, covariance: Array, calibration_sigma: Array | None = None) -> None:
+        sigma, known = np.zeros(HEAD - POSE), () if calibration_sigma is None else calibration_sigma
+        sigma[: len(known)] = known
+        self.mean: Array = np.concatenate([pose, np.zeros(HEAD - POSE)])  # (n,) mean of x
+        self.covariance: Array = block_diag(covariance, np.diag(sigma**2))  # (n, n) covariance of x
+        self.twist: Array = np.zeros(POSE)  # (3,) twist of the vehicle, in m/s, m/s and rad/s
+
+    @property
+    def pose(self) -> Array:
+        """View of the mean pose (3,); theta is not wrapped."""
+        return self.mean[:POSE]
+
+    @property
+    def points(self) -> Array:
+        """View of the mean points (m, 2)."""
+        return self.mean[HEAD:].reshape(-1, POINT)
+
+    @property
+    def sensor(self) -> Array:
+        """View of the mean calibration of the sensor (5,)."""
+        return self.mean[POSE + CALIBRATION_SIZE : HEAD]
+
+    def corrected(self, detections: Detections) -> Detections:
+        """Correct the newest detections by the mean calibration of the sensor."""
+        points = detections.points_vehicle
+        twists = np.tile(self.twist, (len(points), 1))
+        return replace(detections, points_vehicle=corrected(points, twists, self.sensor))
+
+    def by_sensor(self, points_vehicle: Array) -> Array:
+        """Derivatives (m, 2, 5) of the newest detections (m, 2) by the sensor's calibration."""
+        return by_sensor(points_vehicle, np.tile(self.twist, (len(points_vehicle), 1)))
+
+    def follow(self, motion: MeasuredMotion) -> None:
+        """Predict the pose by a motion, and update by a bias that was measured at rest."""
+        self.predict(motion.odometry)
+        if motion.bias is not None:
+            measured, noise = np.array([motion.bias.value]), np.array([[motion.bias.sigma**2]])
+            self.update(np.array([POSE + 1]), lambda x: x, measured, noise)
+
+    def predict(self, odometry: IntegratedOdometry) -> None:
+        """Predict `pose <- pose * delta * (error - J calibration)`; the error is that of the odometry."""
+        drift, size, self.twist = odometry.calibration_jacobian, HEAD + POSE, odometry.twist
+        augmented = np.zeros((size, size))
+        augmented[:HEAD, :HEAD] = self.covariance[:HEAD, :HEAD]
+        augmented[HEAD:, HEAD:] = odometry.covariance
+
+        def drive(x: Array) -> Array:
+            error = x[:, HEAD:] - x[:, POSE : POSE + CALIBRATION_SIZE] @ drift.T
+            return se2.compose(se2.compose(x[:, :POSE], odometry.delta), error)
+
+        moved = transform(drive, np.append(self.mean[:HEAD], np.zeros(POSE)), augmented)
+        cross = moved.slope[:, :HEAD] @ self.covariance[:HEAD, POSE:]
+        self.mean[:POSE] = moved.mean
+        self.covariance[:POSE, :POSE] = moved.covariance
+        self.covariance[:POSE, POSE:] = cross
+        self.covariance[POSE:, :POSE] = cross.T
+
+    def update(
+        self, columns: IntArray, function: Callable[[Array], Array], measured: Array, noise: Array
+    ) -> None:
+        """Update by `measured` (q,): `function(x[columns])`, row by row, plus noise of covariance (q, q)."""
+        predicted = transform(function, self.mean[columns], self.covariance[np.ix_(columns, columns)])
+        root = square_root(predicted.covariance + noise)
+        cross = predicted.slope @ self.covariance[columns]
+        half, _ = lapack.dtrtrs(root, np.column_stack([cross, measured - predicted.mean]), lower=1)
+        self.mean += half[:, :-1].T @ half[:, -1]
+        self.covariance -= half[:, :-1].T @ half[:, :-1]
+        self.covariance = 0.5 * (self.covariance + self.covariance.T)
+
+    def measuring_columns(self, others: IntArray) -> IntArray:
+        """Entries of x that detections depend on: pose, sensor, and others (k,)."""
+        return np.concatenate([np.arange(POSE), SENSOR_COLUMNS, others])
+
+    def measuring(self, points: IntArray) -> Callable[[Array], Array]:
+        """Return the function from [pose | sensor | points] (k, d) to corrected detections of points (k,).
+
+        It is `R' (p - t) - C (b - b0)`, where b0 is the mean calibration of the correction.
+        """
+        expected = to_vehicle_rows(self.pose[None], self.points[points].reshape(1, -1)).reshape(-1, POINT)
+        shift, now = self.by_sensor(expected).reshape(-1, SENSOR_SIZE), self.sensor.copy()
+
+        def detect(x: Array) -> Array:
+            seen = to_vehicle_rows(x[:, :POSE], x[:, POSE + SENSOR_SIZE :])
+            return seen - (x[:, POSE : POSE + SENSOR_SIZE] - now) @ shift.T
+
+        return detect
+
+    def add_points(self, detections: Array, covariances: Array) -> None:
+        """Add points at the end of x, at detections (k, 2) with covariances (k, 2, 2), vehicle frame."""
+        joint = block_diag(self.covariance[:POSE, :POSE], *covariances)
+        mean = np.concatenate([self.pose, detections.ravel()])
+        placed = transform(lambda x: to_map_rows(x[:, :POSE], x[:, POSE:]), mean, joint)
+        cross = placed.slope[:, :POSE] @ self.covariance[:POSE]
+        self.mean = np.concatenate([self.mean, placed.mean])
+        self.covariance = np.block([[self.covariance, cross.T], [cross, placed.covariance]])
+
+    def transform_points(self, start: int, stop: int, matrix: Array, sigma: Array) -> None:
+        """Multiply points [start, stop) by `matrix` (k, stop - start), and add noise of sigma (k,) in m."""
+        low, high = HEAD + POINT * start, HEAD + POINT * stop
+        full = np.kron(matrix, np.eye(POINT))
+        mean, covariance = self.mean, self.covariance
+        cross = full @ covariance[low:high]
+        block = cross[:, low:high] @ full.T + np.diag(np.repeat(sigma, POINT) ** 2)
+        before, after = slice(0, low), slice(high, len(mean))
+        self.mean = np.concatenate([mean[before], full @ mean[low:high], mean[after]])
+        self.covariance = np.block(
+            [
+                [covariance[before, before], cross[:, before].T, covariance[before, after]],
+                [cross[:, before], block, cross[:, after]],
+                [covariance[after, before], cross[:, after].T, covariance[after, after]],
+            ]
+        )
+
+    def reorder(self, points: IntArray) -> None:
+        """Reorder or select points by their indices (k,)."""
+        columns = np.concatenate([np.arange(HEAD), point_columns(points)])
+        self.mean = self.mean[columns]
+        self.covariance = self.covariance[np.ix_(columns, columns)]
+
+
+def point_columns(points: IntArray) -> IntArray:
+    """Entries (2 k,) of points (k,) in x."""
+    return (HEAD + POINT * points[:, None] + np.arange(POINT)).ravel()
+
+
+def to_map_rows(poses: Array, detections: Array) -> Array:
+    """Transform r detections (k, 2 r) from each of k poses (k, 3) to the map frame: `R z + t`."""
+    repeated = np.repeat(poses, detections.shape[1] // POINT, axis=0)
+    return se2.to_map(detections.reshape(-1, POINT), repeated).reshape(len(poses), -1)
+
+
+def to_vehicle_rows(poses: Array, points: Array) -> Array:
+    """Transform r map points (k, 2 r) to the vehicle frame of each of k poses (k, 3): `R' (p - t)`."""
+    repeated = np.repeat(poses, points.shape[1] // POINT, axis=0)
+    return se2.to_vehicle(points.reshape(-1, POINT), repeated).reshape(len(poses), -1)
+
+
+# --- the paper's state: pose and control points of clamped splines, growth and update (paper: Expansion)
 
 RIDGE: Final = 0.05  # lambda of the ridge regression, which ties control points to their places
 SIGMA_ALONG: Final = 1.0  # standard deviation of a cone's distance along the curve from its foot point (m)
@@ -33,8 +232,8 @@ SIGMA_START: Final = 0.3  # added standard deviation of a new curve's control po
 
 def in_map(detections: Detections, pose: Array) -> tuple[Array, Array]:
     """Transform detections from a pose (3,) to the map frame: points (m, 2) and covariances (m, 2, 2)."""
-    turned = rotated(detections.covariances, np.full(len(detections.labels), pose[2]))
-    return to_map(detections.points_vehicle, pose[None]), turned
+    turned = se2.rotated(detections.covariances, np.full(len(detections.labels), pose[2]))
+    return se2.to_map(detections.points_vehicle, pose[None]), turned
 
 
 class CurveState:
@@ -45,10 +244,6 @@ class CurveState:
         self.belief = belief  # mean and covariance of x
         self.curves: dict[int, BSpline] = {}  # by label; knots are current, control points are in the belief
         self.pose_u: dict[int, float] = {}  # parameter of the vehicle's foot point on each curve, not wrapped
-
-    @property
-    def pose(self) -> Array:
-        return self.belief.pose
 
     def offset(self, label: int) -> int:
         """Number of points in x before a curve's first control point."""
@@ -80,13 +275,15 @@ class CurveState:
     def locate_vehicle(self) -> None:
         """Update the vehicle's parameter on each curve: near the last one, or everywhere if it is far off."""
         gate = self.settings.gate
-        heading = np.array([np.cos(self.pose[2]), np.sin(self.pose[2])])
+        heading = np.array([np.cos(self.belief.pose[2]), np.sin(self.belief.pose[2])])
         for label, last in self.pose_u.items():
             low, high = np.array([last - gate.station_behind]), np.array([last + gate.station_ahead])
-            foot = self.foot_points(label, self.pose[None, :2], low, high)
+            foot = self.foot_points(label, self.belief.pose[None, :2], low, high)
             u = float(foot.u[0])
             if foot.tangent_unit[0] @ heading < 0.0 or abs(foot.distance[0]) > gate.station_lateral:
-                u = relocate(self.boundary(label), self.control_points(label), self.pose, gate.station_room)
+                u = relocate(
+                    self.boundary(label), self.control_points(label), self.belief.pose, gate.station_room
+                )
             if self.curves[label].periodic:
                 begin, end = self.curves[label].domain
                 u += (end - begin) * round((last - u) / (end - begin))
@@ -102,7 +299,7 @@ class CurveState:
         belief, p, k = self.belief, self.settings.spline.degree, len(detections)
         count = len(belief.points)
         belief.add_points(detections, covariances)
-        along = path_lengths(detections)
+        along = se2.path_lengths(detections)
         at = np.linspace(0.0, along[-1], p + 1)
         matrix = np.column_stack([np.interp(at, along, row) for row in np.eye(k)])
         belief.transform_points(count, count + k, matrix, np.full(p + 1, SIGMA_START))
@@ -149,7 +346,6 @@ class CurveState:
 
 
 LONGEST_EXTENSION: Final = 12.0  # largest length of one extension (m)
-SIGMA_CARRY: Final = 1.0  # standard deviation of the control point of an extrapolated end (m)
 
 
 class Expansion:
@@ -167,7 +363,7 @@ class Expansion:
 
     def observe(self, state: CurveState, detections: Detections) -> None:
         """Add all detections of a cycle to the tracks, and newly confirmed ones to the observed cones."""
-        points, covariances = in_map(detections, state.pose)
+        points, covariances = in_map(detections, state.belief.pose)
         tracks = self.tentative
         tracks.add(points, covariances, detections.labels, detections.t)
         for label, known in self.observed.items():
@@ -179,13 +375,15 @@ class Expansion:
     ) -> set[int]:
         """Begin or extend each curve by `free` detections (m,), which update none; return grown curves."""
         extended: set[int] = set()
+        model = self.settings.ckf.sigma_model**2 * np.eye(2)
+        detections = replace(detections, covariances=detections.covariances + model)
         for label in BOUNDARIES:
             rows = np.flatnonzero(free & (detections.labels == label))
             found = self._candidates(state, label, detections, rows, path_ahead)
             if label not in state.curves:
                 rows = found.where(found.sides < self.settings.growth.max_lateral).indices
                 if len(rows) > 1:
-                    state.begin(label, detections.points_vehicle[rows], self._covariances(detections, rows))
+                    state.begin(label, detections.points_vehicle[rows], detections.covariances[rows])
             elif self._extend(state, label, detections, found):
                 extended.add(label)
                 self._carried[label] = 0.0
@@ -197,7 +395,7 @@ class Expansion:
         self, state: CurveState, label: int, detections: Detections, rows: IntArray, path_ahead: PathAhead
     ) -> Candidates:
         settings, tentative = self.settings.growth, self.tentative
-        points = to_map(detections.points_vehicle[rows], state.pose[None])
+        points = se2.to_map(detections.points_vehicle[rows], state.belief.pose[None])
         indices = tentative.confirmed(label, settings.sightings)
         confirmed = tentative.points[indices[tentative.undisputed(indices, label)]]
         near = nearest_within(points, confirmed, settings.merge_radius)[1]
@@ -222,18 +420,13 @@ class Expansion:
         last = state.control_points(label)[-1].copy()
         order = proximity_chain(found.points, last)
         points, rows = found.points[order], found.indices[order]
-        covariances = self._covariances(detections, rows)
         for i in range(len(rows)):
             final = i == len(rows) - 1
             too_far = not final and np.hypot(*(points[i + 1] - last)) > LONGEST_EXTENSION
             if final or (too_far and np.hypot(*(points[i] - last)) > GROWTH_THRESHOLD):
-                state.extend(label, detections.points_vehicle[rows[i]], covariances[i])
+                state.extend(label, detections.points_vehicle[rows[i]], detections.covariances[rows[i]])
                 last = points[i]
         return True
-
-    def _covariances(self, detections: Detections, rows: IntArray) -> Array:
-        model = self.settings.ckf.sigma_model**2 * np.eye(2)
-        return np.asarray(detections.covariances[rows] + model)
 
     def _carry_on(self, state: CurveState, label: int, path_ahead: PathAhead) -> bool:
         """Extrapolate a passed end beside the path, nearly up to the vehicle; return whether it grew."""
@@ -247,8 +440,8 @@ class Expansion:
         if not path.MIN_CARRY <= distance <= settings.max_unseen - self._carried[label]:
             return False
         self._carried[label] += distance
-        point_vehicle = (point - state.pose[:2]) @ rotation(state.pose[2])
-        state.extend(label, point_vehicle, SIGMA_CARRY**2 * np.eye(2))
+        point_vehicle = (point - state.belief.pose[:2]) @ se2.rotation(state.belief.pose[2])
+        state.extend(label, point_vehicle, np.eye(2))  # uncertain by 1 m
         return True
 
 
@@ -322,14 +515,14 @@ def on_curve(state: CurveState, label: int, detections: Detections) -> OnCurve:
     """
     gate, curve = state.settings.gate, state.curves[label]
     rows = np.flatnonzero((detections.labels == label) | (detections.labels == UNKNOWN))
-    poses = np.tile(state.pose, (len(rows), 1))
-    points = to_map(detections.points_vehicle[rows], poses)
+    poses = np.tile(state.belief.pose, (len(rows), 1))
+    points = se2.to_map(detections.points_vehicle[rows], poses)
     foot = state.foot_points(label, points, *state.visible_range(label, len(rows)))
     projected = project(points, detections.covariances[rows], poses, foot, state.settings.ckf.sigma_model)
     control, width = foot.span[:, None] + np.arange(-curve.degree, 1), POINT * (curve.degree + 1)
     control = control % curve.size if curve.periodic else control
-    expected = to_vehicle(foot.position, poses)
-    normals = in_vehicle(foot.normal_unit, poses)
+    expected = se2.to_vehicle(foot.position, poses)
+    normals = se2.in_vehicle(foot.normal_unit, poses)
     by_calibration = np.einsum("mi,mik->mk", normals, state.belief.by_sensor(expected))
     by_control = projected.by_control.reshape(len(rows), width)
     gradient = np.concatenate([projected.by_pose, by_calibration, by_control], axis=1)
@@ -387,50 +580,42 @@ def fit_detections(basis: Array, detections: Array, covariances: Array, known: A
     return SplineMeasurement(fitted.mean.reshape(r, 2), fitted.covariance, gain, gain @ basis, known)
 
 
-@dataclass(frozen=True, eq=False)
-class CurveBlock:
-    """Block of the measurement for one curve."""
-
-    columns: IntArray  # (2 r,) entries of the state that are the measured control points
-    fitted: SplineMeasurement  # S_z in the vehicle frame
-    combinations: Array  # (2 r, q) linear combinations of the coordinates of S_z that are measured
-    by_sensor: Array  # (2 r, 5) derivative of S_z by the calibration of the sensor
-
-
 def update(state: CurveState, detections: Detections, found: dict[int, OnCurve]) -> None:
-    """Fit S_z of each curve, and update pose and map by all of them at once."""
-    blocks = [_fit(state, label, detections, on) for label, on in found.items() if len(on.rows)]
-    if not blocks:
+    """Fit S_z of each curve, and update pose and map by all of them at once.
+
+    A fit is on the control points that the detections reach. Their covariances are
+    `K + sigma_model^2 I + sigma_along^2 t t'`, vehicle frame, with unit tangents t.
+    """
+    belief, model = state.belief, state.settings.ckf.sigma_model**2 * np.eye(POINT)
+    own_columns, fits = list[IntArray](), list[SplineMeasurement]()
+    combinations, by_calibration = list[Array](), list[Array]()  # each (2 r, q) and (2 r, 5)
+    for label, on in found.items():
+        if not len(on.rows):
+            continue
+        control = np.flatnonzero(on.basis.sum(axis=0) > 1e-3)
+        known = to_vehicle_rows(state.belief.pose[None], state.control_points(label)[control].reshape(1, -1))
+        t = on.tangents @ se2.rotation(state.belief.pose[2])
+        along = SIGMA_ALONG**2 * t[:, :, None] * t[:, None, :]
+        covariances = detections.covariances[on.rows] + model + along
+        points, basis = detections.points_vehicle[on.rows], on.basis[:, control]
+        fitted = fit_detections(basis, points, covariances, known.reshape(-1, POINT))
+        expected = belief.by_sensor(basis @ fitted.known)
+        own_columns.append(state.columns(label, control))
+        fits.append(fitted)
+        combinations.append(np.asarray(np.kron(fitted.range_basis(), np.eye(POINT)), float))
+        by_calibration.append(np.einsum("rm,mik->rik", fitted.gain, expected).reshape(-1, SENSOR_SIZE))
+    if not fits:
         return
-    ends = np.cumsum([len(block.columns) for block in blocks])
-    head, now = POSE + SENSOR_SIZE, state.belief.sensor.copy()
+    ends, head, now = np.cumsum([*map(len, own_columns)]), POSE + SENSOR_SIZE, belief.sensor.copy()
 
     def predict(x: Array) -> Array:
-        control_vehicle, predicted = to_vehicle_rows(x[:, :POSE], x[:, head:]), []
-        for block, own in zip(blocks, np.split(control_vehicle, ends[:-1], axis=1), strict=True):
-            fitted = block.fitted.refitted(own.reshape(len(x), -1, POINT)).reshape(len(x), -1)
-            predicted.append((fitted - (x[:, POSE:head] - now) @ block.by_sensor.T) @ block.combinations)
+        parts, predicted = np.split(to_vehicle_rows(x[:, :POSE], x[:, head:]), ends[:-1], axis=1), []
+        for own, fitted, combine, slope in zip(parts, fits, combinations, by_calibration, strict=True):
+            seen = fitted.refitted(own.reshape(len(x), -1, POINT)).reshape(len(x), -1)
+            predicted.append((seen - (x[:, POSE:head] - now) @ slope.T) @ combine)
         return np.concatenate(predicted, axis=1)
 
-    columns = state.belief.measuring_columns(np.concatenate([block.columns for block in blocks]))
-    measured = np.concatenate([block.fitted.points.ravel() @ block.combinations for block in blocks])
-    noise = block_diag(*(b.combinations.T @ b.fitted.covariance @ b.combinations for b in blocks))
-    state.belief.update(columns, predict, measured, noise)
-
-
-def _fit(state: CurveState, label: int, detections: Detections, on: OnCurve) -> CurveBlock:
-    """Fit S_z of one curve, on the control points that the detections reach.
-
-    Their covariances are `K + sigma_model^2 I + sigma_along^2 t t'`, vehicle frame, with unit tangents t.
-    """
-    control = np.flatnonzero(on.basis.sum(axis=0) > 1e-3)
-    known = to_vehicle_rows(state.pose[None], state.control_points(label)[control].reshape(1, -1))
-    points = detections.points_vehicle[on.rows]
-    t = on.tangents @ rotation(state.pose[2])
-    along = SIGMA_ALONG**2 * t[:, :, None] * t[:, None, :]
-    covariances = detections.covariances[on.rows] + state.settings.ckf.sigma_model**2 * np.eye(POINT) + along
-    fitted = fit_detections(on.basis[:, control], points, covariances, known.reshape(-1, POINT))
-    combinations: Array = np.asarray(np.kron(fitted.range_basis(), np.eye(POINT)), float)
-    expected = state.belief.by_sensor(on.basis[:, control] @ fitted.known)
-    by_calibration = np.einsum("rm,mik->rik", fitted.gain, expected).reshape(-1, SENSOR_SIZE)
-    return CurveBlock(state.columns(label, control), fitted, combinations, by_calibration)
+    pairs = list(zip(fits, combinations, strict=True))
+    measured = np.concatenate([fitted.points.ravel() @ combine for fitted, combine in pairs])
+    noise = block_diag(*(combine.T @ fitted.covariance @ combine for fitted, combine in pairs))
+    belief.update(belief.measuring_columns(np.concatenate(own_columns)), predict, measured, noise)

@@ -7,22 +7,10 @@ from typing import Any, Final
 LONGEST: Final = 3  # most values of an array that its text lists
 
 
-def pictures() -> Any:
-    return import_module("pathspace_graph.eval.figures.map_plot")
-
-
-def frames() -> Any:
-    return import_module("pathspace_graph.frames")
-
-
-def notebook() -> Any:
-    return import_module("pathspace_graph.eval.figures.notebook")
-
-
 def notebook_html(record: Any) -> str | None:
     """HTML of a record for a notebook, which shows its text where this is None: without the extra `eval`."""
     try:
-        return str(notebook().html(record))
+        return str(import_module("pathspace_graph.eval.figures.notebook").html(record))
     except ModuleNotFoundError:
         return None
 

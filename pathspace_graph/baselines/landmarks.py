@@ -1,30 +1,29 @@
-"""The landmark map: landmarks and their variables, detections with associations, and two rows for each."""
+"""Landmarks: their variables, detections and rows, associations, and the least-squares problem of a drive.
 
+`OnlineBaseline` is the base of all online baselines: the mapper's front end.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Final, Self, TypeAlias
 
 import numpy as np
+import scipy  # imports its modules on first use
 
 from pathspace_graph.batch.association import insert_drive
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.noise import KnownNoise, huber_loss, huber_weights, whiteners
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.residuals import landmark_residuals
+from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
 from pathspace_graph.factors.se2 import to_map
-from pathspace_graph.factors.sensor import restored
-from pathspace_graph.front_end.front_end import is_orange, judge_log
+from pathspace_graph.factors.sensor import by_sensor, restored
+from pathspace_graph.front_end.front_end import FrontEnd, Reading, is_orange, judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square
-from pathspace_graph.graph.elimination import (
-    Damping,
-    Elimination,
-    linear_graph,
-    marginal_before,
-    owners,
-    solution,
-)
+from pathspace_graph.graph import elimination
 from pathspace_graph.graph.rows import Rows
-from pathspace_graph.graph.smoother import FixedLagSmoother
+from pathspace_graph.graph.smoother import FixedLagSmoother, merge_points
 from pathspace_graph.graph.variables import (
     LANDMARK_LETTER,
     POINT,
@@ -35,12 +34,15 @@ from pathspace_graph.graph.variables import (
     landmark_keys,
     pose_keys,
 )
-from pathspace_graph.io.log import Detections, Log
+from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import NO_COVARIANCE, Map, PointBoundary
 from pathspace_graph.io.results import RunNoise
-from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT, UNKNOWN
 from pathspace_graph.mapping.detections import DetectionColumns
-from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.mapping.motion import known_noise
+from pathspace_graph.mapping.tracks import nearest_within
+from pathspace_graph.run import CycleResult, Stopwatch
+from pathspace_graph.settings.mapper import GrowthSettings, MapperSettings, known_settings
 
 UNASSOCIATED: Final = -1  # landmark of a detection without one, which may create one
 AMBIGUOUS: Final = -2  # landmark of a detection without one, which must not create one
@@ -262,16 +264,16 @@ class LandmarkSystem:
         """All rows, those of the detections last, weighted by a Huber threshold (sigmas)."""
         rows = landmark_rows(state, self.detections, np.flatnonzero(self.detections.used), huber)
         labels = state.labels[state.positions(indices(rows.keys[:, -1]))]
-        seen = replace(rows, owner=owners(rows.owner, labels == RIGHT))
+        seen = replace(rows, owner=elimination.owners(rows.owner, labels == RIGHT))
         return [*self.chain.rows_at(state.variables, self.settings.calibration), seen]
 
-    def eliminated(self, state: LandmarkState) -> Elimination:
-        graph = linear_graph(self.rows(state, self.settings.gate.huber), state.variables)
-        return Elimination(graph, state.variables.layout)
+    def eliminated(self, state: LandmarkState) -> elimination.Elimination:
+        graph = elimination.linear_graph(self.rows(state, self.settings.gate.huber), state.variables)
+        return elimination.Elimination(graph, state.variables.layout)
 
     def optimize(self, state: LandmarkState) -> None:
         """Optimize a state by Levenberg-Marquardt with fixed associations; landmarks are damped (1/m^2)."""
-        variables, cost, damping = state.variables, self.cost(state), Damping()
+        variables, cost, damping = state.variables, self.cost(state), elimination.Damping()
         keys = np.repeat(state.keys, POINT)[:, None]
         still = Rows(
             keys,
@@ -282,7 +284,8 @@ class LandmarkSystem:
         for _ in range(80):
             damped = replace(still, jacobian=np.sqrt(damping.weight) * still.jacobian)
             rows, before = self.rows(state, self.settings.gate.huber), variables.values
-            variables.values = before + solution(linear_graph([*rows, damped], variables), variables.layout)
+            graph = elimination.linear_graph([*rows, damped], variables)
+            variables.values = before + elimination.solution(graph, variables.layout)
             gain = cost - self.cost(state)
             if gain < 0.0:
                 variables.values = before
@@ -300,7 +303,7 @@ class LandmarkSystem:
         It is given by keys, mean (n,) and information (n, n).
         """
         rows = self.rows(state, self.settings.gate.huber)
-        layout, information, vector = marginal_before(rows, state.variables, first)
+        layout, information, vector = elimination.marginal_before(rows, state.variables, first)
         here = state.variables.values[state.variables.layout.entries(layout.keys)]
         return layout.keys, here + np.linalg.solve(information, vector), information
 
@@ -338,3 +341,199 @@ def start_oracle(system: LandmarkSystem, associations: IntArray) -> LandmarkStat
     state.votes = votes[:, : len(BOUNDARIES)]
     insert_drive(state.variables, calibration, poses)
     return state
+
+
+# --- association of detections with landmarks by Hungarian assignment, and of landmarks of one cone -----
+
+ROUGH_GATE: Final = 5.0  # largest distance of a tested landmark from a detection of the cycle (m)
+CREATE: Final = 0.99  # probability of the gates outside of which a detection may be new
+MATCH_GATE: Final = chi2_quantile(0.95, POINT)  # gate of a match (squared Mahalanobis distance)
+CREATE_GATE: Final = chi2_quantile(CREATE, POINT)  # gate outside of which a detection may be new
+
+
+def assign(cost: Array) -> tuple[IntArray, BoolArray]:
+    """Minimize `sum_ij cost_ij` over one-to-one assignments; an unassigned detection costs the match gate.
+
+    cost (m, n) are squared Mahalanobis distances of detections to landmarks, infinite for other labels.
+    Return the column (m,) of each landmark, or UNASSOCIATED, and whether detections (m,) may create one.
+    """
+    landmark = np.full(len(cost), UNASSOCIATED, np.intp)
+    rows, columns = scipy.optimize.linear_sum_assignment(np.minimum(cost, MATCH_GATE))
+    chosen = cost[rows, columns] < MATCH_GATE
+    landmark[rows[chosen]] = columns[chosen]
+    return landmark, np.asarray((cost > CREATE_GATE).all(axis=1))
+
+
+def squared_mahalanobis(innovations: Array, covariances: Array) -> Array:
+    """Compute `r' S^-1 r` (...,) for innovations (..., 2) with covariances (..., 2, 2), in closed form."""
+    x, y = innovations[..., 0], innovations[..., 1]
+    xx, xy, yy = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
+    return np.asarray((yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy))
+
+
+def pair_costs(points: Array, covariances: Array, predicted: Array, predicted_covariances: Array) -> Array:
+    """Squared Mahalanobis distances (m, n) of detections (m, 2) and predicted ones (n, 2).
+
+    Their covariances are (m, 2, 2) and (n, 2, 2).
+    """
+    innovations = predicted[None] - points[:, None]
+    return squared_mahalanobis(innovations, predicted_covariances[None] + covariances[:, None])
+
+
+def hysteresis_costs(cost: Array, held: BoolArray) -> Array:
+    """Keep previous (`held`) pairs in the match gate up to the create gate, so that they do not flip."""
+    inside = (1.0 - 1e-9) * MATCH_GATE  # against round-off
+    return np.where(held & (cost < CREATE_GATE), np.minimum(cost, inside), cost)
+
+
+def compatible(labels: IntArray, landmark_labels: IntArray) -> BoolArray:
+    """Whether the detection of each pair (m, n) has the landmark's label or an unknown one."""
+    return np.asarray((labels[:, None] == landmark_labels[None]) | (labels == UNKNOWN)[:, None])
+
+
+def associate_newest(smoother: LandmarkSmoother, new: slice, eligible: BoolArray) -> None:
+    """Associate the rows `new` of the newest pose with eligible (n,) landmarks.
+
+    A detection between the gates becomes AMBIGUOUS. So does a detection in the match gate of a landmark with
+    another label, and votes for its own label.
+    """
+    detections, state = smoother.map.detections, smoother.map.state
+    rows = np.arange(new.start, new.stop)
+    points = detections.points_map(rows, smoother.variables)
+    near = nearest_within(state.landmarks, points, ROUGH_GATE)[1]
+    landmarks = np.flatnonzero(near & eligible)
+    numbers = state.numbers[landmarks]
+    predicted = predicted_points(smoother, landmarks)
+    any_label = pair_costs(detections.point[rows], detections.covariance[rows], *predicted)
+    same_label = compatible(detections.label[rows], state.labels[landmarks])
+    landmark, is_new = assign(np.where(same_label, any_label, np.inf))
+    matched = landmark != UNASSOCIATED
+    detections.take(rows[matched], numbers[landmark[matched]])
+    explained = (any_label < MATCH_GATE).any(axis=1)
+    detections.landmark[rows[~matched & (~is_new | explained)]] = AMBIGUOUS
+    if explained.any():
+        state.vote(detections.label[rows[explained]], numbers[any_label[explained].argmin(axis=1)])
+
+
+def predicted_points(smoother: LandmarkSmoother, landmarks: IntArray) -> tuple[Array, Array]:
+    """Predict detections of landmarks (k,), by position, from the newest pose.
+
+    They (k, 2) are in m, vehicle frame, with covariances `H_j Sigma H_j'` (k, 2, 2). Sigma is the covariance
+    of pose and landmark in the last step, and zero before the first one.
+    """
+    state, k = smoother.map.state, len(landmarks)
+    cycles = np.full(k, smoother.next_cycle - 1)
+    poses, zero = smoother.variables.poses_at(cycles), np.zeros((k, POINT))
+    expected = landmark_residuals(poses, state.landmarks[landmarks], zero)
+    if smoother.last_step is None or k == 0:
+        return expected.residual, np.zeros((k, POINT, POINT))
+    columns = len(smoother.variables.sensor)
+    sensor = by_sensor(expected.residual, np.tile(smoother.map.twist, (k, 1)))[:, :, :columns]
+    jacobian = np.concatenate([expected.by_pose, -sensor, expected.by_landmark], axis=2)
+    rows = two_rows(cycles, state.numbers[landmarks], jacobian, zero)
+    return expected.residual, smoother.predicted_covariance(rows, together=POINT)
+
+
+def associate_created(
+    points: Array, cycles: IntArray, landmarks: Array, settings: GrowthSettings
+) -> tuple[IntArray, IntArray]:
+    """Return the rows of detections (m, 2) that belong to new landmarks (k, 2), and the landmark of each.
+
+    A detection belongs to the nearest landmark within the merge radius, if it is the nearest of its cycle.
+    """
+    if len(points) == 0 or len(landmarks) == 0:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    nearest, near = nearest_within(points, landmarks, settings.merge_radius)
+    rows = np.argsort(np.hypot(*(points - landmarks[nearest]).T), kind="stable")
+    rows = rows[near[rows]]
+    _, first = np.unique(np.column_stack([cycles[rows], nearest[rows]]), axis=0, return_index=True)
+    chosen = rows[first]
+    return chosen, nearest[chosen]
+
+
+def find_duplicates(
+    state: LandmarkState, known: int, covariance: Callable[[IntArray], Array], settings: MapperSettings
+) -> tuple[IntArray, IntArray]:
+    """Find duplicates: the positions (k,) of landmarks, and of older landmarks of the same cone.
+
+    Of the pairs of one label in the merge radius and the match gate, the nearest ones are taken, each
+    landmark once.
+    """
+    points, labels = state.landmarks[:known], state.labels[:known]
+    distance = np.hypot(*np.moveaxis(points[:, None] - points[None], 2, 0))
+    near = (distance < settings.growth.merge_radius) & (labels[:, None] == labels[None])
+    newer, older = np.nonzero(np.tril(near, -1))
+    involved, index = np.unique(np.concatenate([newer, older]), return_inverse=True)
+    if len(involved) == 0:
+        return newer, older
+    spread = difference_covariances(covariance(state.keys[involved]), *index.reshape(2, -1))
+    squared = squared_mahalanobis(points[newer] - points[older], spread)
+    taken, chosen = set[int](), list[int]()
+    for row in np.argsort(squared)[: int((squared < MATCH_GATE).sum())].tolist():
+        pair = {int(newer[row]), int(older[row])}
+        if taken.isdisjoint(pair):
+            taken |= pair
+            chosen.append(row)
+    return newer[chosen], older[chosen]
+
+
+def difference_covariances(joint: Array, i: IntArray, j: IntArray) -> Array:
+    """Covariances (..., 2, 2) of the differences of points i and j (...,), plus that of `SIGMA_MERGE`."""
+    blocks = joint.reshape(len(joint) // POINT, POINT, -1, POINT)
+    spread = blocks[i, :, i] + blocks[j, :, j] - blocks[i, :, j] - blocks[j, :, i]
+    return np.asarray(spread + SIGMA_MERGE**2 * np.eye(POINT))
+
+
+def merge(smoother: LandmarkSmoother, gone: IntArray, kept: IntArray) -> None:
+    """Merge the landmarks at positions `gone` (k,) into those at `kept` (k,), and take one step."""
+    keys = smoother.map.state.keys
+    merge_points(smoother, keys[gone], keys[kept])
+    smoother.map.merge(gone, kept)
+    smoother.step()
+
+
+# --- base of the online baselines: the mapper's front end -----------------------------------------------
+
+FRONT_END: Final = ("closing", "gate", "growth", "motion", "noise", "sides", "spline")
+"""Settings of the front end and of the growth of landmarks."""
+
+
+class OnlineBaseline:
+    """Online estimator; a subclass maps the readings of the front end.
+
+    `odometry_sigma` (3,) is the standard deviation of a twist reading (m/s, m/s, rad/s).
+    """
+
+    def __init__(
+        self, settings: MapperSettings | None = None, odometry_sigma: Array | KnownNoise | None = None
+    ) -> None:
+        self.settings = known_settings(settings)
+        self.front_end = FrontEnd(self.settings, known_noise(odometry_sigma))
+        self._begin()
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Initialize the subclass."""
+
+    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
+        watch = Stopwatch()
+        cycle = self.front_end.admit(odometry, detections)
+        reading = self.front_end.update(cycle.odometry, cycle.detections)
+        return cycle.counted(self._process(reading, watch))
+
+    @abstractmethod
+    def _process(self, reading: Reading, watch: Stopwatch) -> CycleResult:
+        """Map a cycle."""
+
+    @abstractmethod
+    def _map(self, with_covariance: bool) -> Map:
+        """Return a copy of the map."""
+
+    def map(self) -> Map:
+        return self._map(True)
+
+    def outline(self) -> Map:
+        return self._map(False)
+
+    def noise_used(self) -> RunNoise:
+        return self.front_end.noise_used
