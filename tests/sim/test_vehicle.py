@@ -144,7 +144,7 @@ def test_a_start_beside_a_bend_begins_in_its_own_direction() -> None:
     pose = line.points(np.array([0.0]))[0] + 2.0 * left_of(line.tangents(np.array([0.0])))[0]
     heading = np.arctan2(*line.tangents(np.array([0.0]))[0][::-1]) + 0.3
     s = np.array([0.0, 1e-4])
-    offset = _settling(line, 0.0, np.append(pose, heading), s, VehicleSettings())
+    offset = _settling(line, 0.0, np.append(pose, heading), s)
     path = line.points(s) + left_of(line.tangents(s)) * offset[:, None]
     assert np.arctan2(*np.diff(path, axis=0)[0][::-1]) == pytest.approx(heading, abs=1e-3)
 
@@ -160,7 +160,7 @@ def test_a_vehicle_brakes_before_it_stands() -> None:
 def test_the_wander_begins_in_the_middle() -> None:
     """It grows like the square of the distance, by `1 - exp(-(s / 5 m)^2)`."""
     s = np.array([0.0, 0.5, 20.0])
-    offsets = [_wander(s, np.full(3, 5.0), VehicleSettings(), np.random.default_rng(k)) for k in range(20)]
+    offsets = [_wander(s, np.full(3, 5.0), 0.3, np.random.default_rng(k)) for k in range(20)]
     least, near, far = np.abs(offsets).max(axis=0)
     assert least == 0.0 and near < 0.003
     assert 0.2 < far < 0.3
