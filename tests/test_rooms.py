@@ -19,7 +19,7 @@ EXTRAS = {"distributed", "rerun", "rosbags", "builtin_interfaces"} | ROS
 LATE = {
     "commands.estimate": {"eval.view.recording", "commands.plot"},
     "options.runs": {"io.overrides"},
-    "io.brief": {"eval.figures.map_plot", "eval.figures.notebook", "frames"},
+    "io.brief": {"eval.figures.drawing", "eval.figures.notebook", "frames"},
     "settings.checked": {"io.brief"},
 }
 """Modules that are imported by name when needed, since matplotlib is slow."""

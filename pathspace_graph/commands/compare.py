@@ -15,10 +15,9 @@ from pathspace_graph.estimators import DEFAULT_ONLINE, make_online
 from pathspace_graph.eval.experiment import compare as experiment
 from pathspace_graph.eval.experiment.compare import compare, side_by_side
 from pathspace_graph.eval.experiment.run import check_jobs, run_estimator, unfinished, workers
-from pathspace_graph.eval.figures.map_plot import plot_apart, plot_map
-from pathspace_graph.eval.figures.style import save_plot
+from pathspace_graph.eval.figures.drawing import plot_apart, plot_map, save_plot
 from pathspace_graph.eval.metrics.alignment import maps_apart
-from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
+from pathspace_graph.eval.metrics.measures import laps_of, not_mapped, summarize
 from pathspace_graph.io.files import atomic_folder, check_target, write_json
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import read_map

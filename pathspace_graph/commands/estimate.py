@@ -21,9 +21,9 @@ from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
-from pathspace_graph.eval.metrics import summary
+from pathspace_graph.eval.metrics import measures
 from pathspace_graph.eval.metrics.alignment import MapDifference, differences
-from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
+from pathspace_graph.eval.metrics.measures import laps_of, not_mapped, summarize
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import inverse
 from pathspace_graph.graph.exchange import GRAPH_FILE, write_graph
@@ -265,7 +265,7 @@ def map_online(
     log: Log, estimator: OnlineEstimator, name: str = DEFAULT_ONLINE, observers: Sequence[Observer] = ()
 ) -> RunResult:
     """Map a log with progress; the map at the end of each true lap is kept where there is truth."""
-    times = summary.lap_times(log)
+    times = measures.lap_times(log)
     with progress("mapping", len(log.cycles)) as advance, solving("an update"):
         watching = [lambda _: advance(), *observers]
         return run_online(log, estimator, name=name, snapshot_times=times, observers=watching, outlines=True)
@@ -306,7 +306,7 @@ def outline(result: RunResult, begin: float = 0.0) -> str:
     orange = sorted(result.map.points.items())
     cones = [f"{own.size} {NAMES[label].replace('_', ' ')} cones" for label, own in orange]
     size = [] if result.scale == 1.0 else [f"{result.scale:g} times the size of a Formula Student track"]
-    number = counts([summary.health_of(record) for record in result.cycles])
+    number = counts([measures.health_of(record) for record in result.cycles])
     reasons = Counter(record.reason for record in result.cycles if record.health == DEGRADED)
     mostly = f" (mostly: {reasons.most_common(1)[0][0]})" if reasons else ""
     health = [
@@ -314,7 +314,7 @@ def outline(result: RunResult, begin: float = 0.0) -> str:
         for condition, why in ((DEGRADED, mostly), (LOST, ""))
         if number[condition]
     ]
-    last = summary.stretches_of(result)[-1:]
+    last = measures.stretches_of(result)[-1:]
     if last and last[0].health == LOST and last[0].end == result.cycles[-1].t:
         health.append(f"still lost since {last[0].begin - begin:.1f} s ({last[0].reason})")
     return ", ".join([laps, loop, points, *cones, *size, *health])

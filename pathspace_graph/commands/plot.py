@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any, Final
 
-from pathspace_graph.eval.figures.map_plot import plot_map
-from pathspace_graph.eval.figures.style import check_plot_file, save_plot
+from pathspace_graph.eval.figures.drawing import check_plot_file, plot_map, save_plot
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.files import check_file_target
 from pathspace_graph.io.log_files import read_log

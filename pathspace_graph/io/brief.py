@@ -8,7 +8,7 @@ LONGEST: Final = 3  # most values of an array that its text lists
 
 
 def pictures() -> Any:
-    return import_module("pathspace_graph.eval.figures.map_plot")
+    return import_module("pathspace_graph.eval.figures.drawing")
 
 
 def frames() -> Any:

@@ -208,7 +208,7 @@ class Log(Shown):
         )
 
     def plot(self, **options: Any) -> Figure:
-        """Draw the log; the options are those of `eval.figures.map_plot.plot_log`."""
+        """Draw the log; the options are those of `eval.figures.drawing.plot_log`."""
         figure: Figure = pictures().plot_log(self, **options)
         return figure
 

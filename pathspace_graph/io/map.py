@@ -150,7 +150,7 @@ class Map(Shown):
         return replace(self, boundaries=boundaries, joint_covariance=joint, points=points)
 
     def plot(self, **options: Any) -> Figure:
-        """Draw the map; the options are those of `eval.figures.map_plot.plot_map`."""
+        """Draw the map; the options are those of `eval.figures.drawing.plot_map`."""
         figure: Figure = pictures().plot_map(self, **options)
         return figure
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from pathspace_graph import estimators as registry
 from pathspace_graph.cli import parse, run_command
 from pathspace_graph.eval.experiment.run import run_estimator
-from pathspace_graph.eval.metrics.summary import versions
+from pathspace_graph.eval.metrics.measures import versions
 from pathspace_graph.io.files import atomic_file, atomic_folder
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.log_files import read_log, write_log
@@ -124,7 +124,7 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     rings.register(monkeypatch)
     monkeypatch.setitem(registry.ONLINE, "fixed-lag", rings.Rings)  # the shipped study names it
     monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: Path(file).write_bytes(b"picture"))
-    monkeypatch.setattr("pathspace_graph.eval.figures.style.SUFFIXES", (".png",))
+    monkeypatch.setattr("pathspace_graph.eval.figures.drawing.SUFFIXES", (".png",))
     study, rows = "pathspace_graph.eval.experiment", [{"lap": 1, "rmse": 0.5}, {"lap": None}]
     monkeypatch.setattr(f"{study}.study.StudyDrive.load", lambda _: (recorded.log, ()))
     monkeypatch.setattr(f"{study}.run.measure", lambda *_, **__: rows)
