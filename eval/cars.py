@@ -69,7 +69,6 @@ def simulated(car: str, track: int, seed: int) -> Log:
 OWN, OTHER = "another drive's", "another track's"
 SIGMA_SURVEY: Final = 0.15  # of the cones of a surveyed map (m)
 SOON: Final = 8.0  # time after which the vehicle should be found (s)
-DRIVEN: Final = 40.0  # time that is driven on a known map (s)
 WRONG: Final = 2.0  # distance (m) from the true pose at which the place where it was found is a wrong one
 
 
@@ -115,11 +114,11 @@ def surveyed(truth: Truth, rng: np.random.Generator, moved: int = 0) -> Map:
 
 
 def begun_later(log: Log, share: float) -> Log:
-    """Return a log from a share of its first half's time on, without truth, which is in another frame."""
+    """Return 40 s of a log from a share of its first half's time on, without truth: its frame is another."""
     t = log.odometry.t
     begin = float(t[0] + 0.5 * share * (t[-1] - t[0]))
     later = log.odometry.between(begin, float(t[-1]))
-    cycles = tuple(cycle for cycle in log.cycles if later.t[0] < cycle.t < begin + DRIVEN)
+    cycles = tuple(cycle for cycle in log.cycles if later.t[0] < cycle.t < begin + 40.0)
     return replace(log, odometry=later, cycles=cycles, truth=None)
 
 

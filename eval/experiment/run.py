@@ -75,7 +75,6 @@ MEASURED: Final = (  # modules on which every result depends, whatever the estim
     *("run", "sim.simulate", "sim.track_generator", "plausibility.diagnosis"),
     "eval.metrics.measures",
 )
-NUMERICS: Final = {name: version(name) for name in ("gtsam", "numpy", "scipy")}
 Code = dict[str, str]  # digest of each source by its module, and version of each library by its name
 
 
@@ -102,7 +101,8 @@ def code_from(module: str) -> Code:
         remaining += [(imported, package) for imported in _imports(name)]
     known = packages_distributions() if libraries else {}
     used = {distribution for library in libraries for distribution in known.get(library, [])}
-    return dict(sorted(found.items())) | NUMERICS | {name: version(name) for name in sorted(used)}
+    versioned = ("gtsam", "numpy", "scipy", *sorted(used))  # the first of which all results depend on
+    return dict(sorted(found.items())) | {name: version(name) for name in versioned}
 
 
 @cache
@@ -562,7 +562,18 @@ def run_study(
     plan = study if isinstance(study, Plan) else make_plan(study, keep=keep)
     with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
         records = run_records(plan, Path(folder), **how)
-        add_agreement(Path(folder), plan.cells, records)
+        # how far each kept map of a recorded log is from those of the other logs of its track (m)
+        maps = dict[tuple[Any, ...], dict[str, Map]]()
+        for cell in plan.cells:
+            run = run_folder(Path(folder), cell)
+            if cell.drive.simulation is None and (run / MAP_FILE).exists():
+                key = (cell.drive.track, cell.estimator, cell.settings, cell.parameters)
+                maps.setdefault(key, {})[cell.id] = read_map(run)
+    for alike in maps.values():
+        for one, other in combinations(alike, 2):
+            apart = aligned_distance(alike[one], alike[other])
+            for whole in (records[one]["rows"][-1], records[other]["rows"][-1]):
+                whole["agreement"] = whole.get("agreement", 0.0) + apart / (len(alike) - 1)
     return frame_of(plan.study, [(cell, records[cell.id]) for cell in plan.cells])
 
 
@@ -593,20 +604,6 @@ def run_records(
     with workers(jobs, cluster), locked(out):
         write_json(file, plan.resolved(), indent=1)
         return run_cells(plan.cells, out, on_cell=on_cell, retry_failed=retry_failed)
-
-
-def add_agreement(out: Path, cells: Sequence[EstimatorCell], records: Mapping[str, Record]) -> None:
-    """Add how far each kept map of a recorded log is from those of the other logs of its track (m)."""
-    maps = dict[tuple[Any, ...], dict[str, Map]]()
-    for cell in cells:
-        if cell.drive.simulation is None and (run_folder(out, cell) / MAP_FILE).exists():
-            key = (cell.drive.track, cell.estimator, cell.settings, cell.parameters)
-            maps.setdefault(key, {})[cell.id] = read_map(run_folder(out, cell))
-    for alike in maps.values():
-        for one, other in combinations(alike, 2):
-            apart = aligned_distance(alike[one], alike[other])
-            for whole in (records[one]["rows"][-1], records[other]["rows"][-1]):
-                whole["agreement"] = whole.get("agreement", 0.0) + apart / (len(alike) - 1)
 
 
 # --- results ---------------------------------------------------------------------------------------------

@@ -26,7 +26,6 @@ RUN: Final = ("track", "seed")  # columns of a drive; combinations are paired on
 RUN_OF: Final = (*RUN, *COMBINATION)
 TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
 LEVEL: Final = 0.95  # confidence level of intervals; a difference is significant if p < 1 - LEVEL
-ROUND_OFF: Final = 1e-12  # share of differences below which they are all the same
 
 MADE: Final = ("commit", "host", "processor", "blas", "date", "command")  # where and when a run was made
 RATIO: Final = "ratio"  # note of a ratio of two estimators beside a published one
@@ -63,7 +62,7 @@ def paired_p(differences: Array) -> float:
     """
     if len(differences) < 2:
         return float("nan")
-    if np.ptp(differences) <= ROUND_OFF * np.abs(differences).max():
+    if np.ptp(differences) <= 1e-12 * np.abs(differences).max():  # but for round-off all are the same
         return float(differences[0] == 0.0)
     return float(stats.ttest_1samp(differences, 0.0).pvalue)
 

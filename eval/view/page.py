@@ -27,13 +27,11 @@ from pathspace_graph.labels import NAMES
 
 from .recording import OUTLINE
 
-OPTIONAL: Final = {"offered": 0, "health": "", "reason": ""}  # columns of the cycles that may be missing
 TRAIL: Final = 10.0  # time for which the path behind the vehicle is thick (s)
 OVER: Final[dict[str, Any]] = {  # of a figure over the time or along a boundary
     **{"height": 165, "sizing_mode": "stretch_width"},
     **{"min_border_left": 55, "toolbar_location": None},  # the axes below each other
 }
-LEGEND: Final = {"padding": 2, "margin": 0, "label_text_font_size": "9pt", "click_policy": "hide"}
 
 PAGE: Final = Template("""{% extends base %}
 {% block postamble %}
@@ -104,7 +102,8 @@ def page(
     `other` is the name of another map, the map, and how it lies on this one (`maps_apart(other, track)`).
     """
     begin = float(cycles["t"].iloc[0])
-    missing = {name: value for name, value in OPTIONAL.items() if name not in cycles}
+    optional = {"offered": 0, "health": "", "reason": ""}
+    missing = {name: value for name, value in optional.items() if name not in cycles}
     cycles = cycles.assign(since=cycles["t"] - begin, ms=1e3 * cycles["seconds"], **missing)
     source = ColumnDataSource({name: cycles[name].to_numpy() for name in cycles}, name="cycles")
     vehicle, driven = (ColumnDataSource({"x": [], "y": []}, name=name) for name in ("vehicle", "driven"))
@@ -134,7 +133,8 @@ def page(
     fixed = {"cycles": source, "ahead": ahead, "left": left, "trail": TRAIL}
     move = CustomJS(args=moved | fixed, code=MOVE)
     slider.js_on_change("value", move)
-    document = Document(theme=Theme(json={"attrs": {"Legend": LEGEND}}))
+    legend = {"padding": 2, "margin": 0, "label_text_font_size": "9pt", "click_policy": "hide"}
+    document = Document(theme=Theme(json={"attrs": {"Legend": legend}}))
     document.js_on_event(DocumentReady, move)
     for root in (slider, readout, drawn, *over):
         document.add_root(root)

@@ -173,21 +173,3 @@ MISTAKES: Final[dict[str, Callable[[Log], Log]]] = {
     ),
 }
 """Mistakes by name."""
-
-
-CAUSES: Final[dict[str, tuple[str, ...]]] = {  # that tell a mistake, by the longest beginning of its name
-    **{name: (name,) for name in ("positions", "speeds", "yaw rate", "y to the right", "stamps")},
-    **{name: (name,) for name in ("odometry", "covariances", "sides", "sensor frame")},
-    "all lengths": ("positions", "speeds"),
-    "bearings": ("unexplained",),
-    "sensor frame: 2 m ahead": ("mounting",),
-    "speeds in the map frame": ("odometry",),
-    "detections in the map frame": ("map frame",),
-    "detections 1 s late": ("clocks",),
-    "all labels": ("labels",),
-}
-
-
-def causes_of(mistake: str) -> tuple[str, ...]:
-    """Return the causes of which one must be named."""
-    return CAUSES[max((begin for begin in CAUSES if mistake.startswith(begin)), key=len)]
