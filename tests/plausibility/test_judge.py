@@ -22,7 +22,7 @@ from pathspace_graph.sim.track_generator import generate_track
 from ..scenes.drives import ahead, corridor, detections, exact_log, short_drive
 from ..scenes.lines import line_drive
 from .good_logs import EDITED, PRESET, SIMULATED, good_log
-from .mistakes import MISTAKES, in_frame, late, side_late, with_cycles, with_points, with_twists
+from .mistakes import MISTAKES, in_frame, late, side_late, with_cycles, with_twists
 
 SAID = {
     "positions in millimetres": ("in millimetres", "multiply x and y by 0.001"),
@@ -41,11 +41,8 @@ SAID = {
     "sensor frame: x to the right, y ahead": ("x to the right and y ahead", "y into column x and -x into"),
     "sensor frame: x to the left": ("x to the left and y to the rear", "-y into column x and x into"),
     "sensor frame: x to the rear": ("x to the rear and y to the right", "-x into column x and -y into"),
-    "sensor frame: turned by 30 degrees": ("degrees to the left in",),
-    "sensor frame: turned by 10 degrees": ("degrees to the right in",),
     "sensor frame: camera, z ahead": ("z ahead, x to the right and y down", "z into column x and -x into"),
     "sensor frame: x and y swapped": ("x and y are swapped", "y into column x and x into column y"),
-    "sensor frame: 2 m ahead": ("whose origin is not the vehicle's",),
     "positions in centimetres": ("in centimetres", "multiply x and y by 0.01"),
     "speeds in km/h": ("in km/h", "multiply vx and vy by 0.27778"),
     "yaw rate to the right": ("positive to the right", "negate column wz"),
@@ -116,14 +113,9 @@ def test_the_angle_of_a_turned_sensor_is_told(turn: float) -> None:
 
 def test_the_place_of_a_sensor_is_told() -> None:
     (found,) = hints(in_frame(short_drive(), ahead=2.5, left=-1.0))
-    assert found.cause == "mounting"
+    assert found.cause == "mounting" and "whose origin is not the vehicle's" in found.likely
     words = found.advice.split()
     assert [float(words[1]), float(words[5].strip(","))] == pytest.approx([2.5, -1.0], abs=0.4)
-
-
-def test_two_mistakes_are_both_told() -> None:
-    log = with_twists(with_points(short_drive(), lambda points: 1000.0 * points[:, ::-1]), (3.6, 3.6, 1.0))
-    assert [hint.cause for hint in hints(log)] == ["positions", "speeds", "sensor frame"]
 
 
 def test_a_vehicle_that_goes_backward_by_its_odometry_alone_is_told() -> None:

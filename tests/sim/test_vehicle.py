@@ -49,17 +49,6 @@ def test_integration_is_the_exponential_map() -> None:
         np.testing.assert_allclose([np.cos(found[2]), np.sin(found[2])], pose[:2, 0], atol=1e-12)
 
 
-def test_twists_integrate_to_the_poses(driven: tuple[Track, Trajectory]) -> None:
-    _, d = driven
-    pose = np.eye(3)
-    steps = np.diff(d.t)
-    for k, step in enumerate(steps):
-        pose = pose @ matrix_exponential(d.twists[k], float(step))
-        if k % 100 == 0:
-            np.testing.assert_allclose(pose[:2, 2], d.poses[k + 1, :2], atol=1e-6)
-    np.testing.assert_allclose(pose[:2, 2], d.poses[-1, :2], atol=1e-6)
-
-
 def test_starts_at_the_origin_at_a_standstill(driven: tuple[Track, Trajectory]) -> None:
     _, d = driven
     np.testing.assert_array_equal(d.poses[0], np.zeros(3))
