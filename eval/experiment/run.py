@@ -490,25 +490,6 @@ class Plan(Brief):
     tracks: tuple[Track, ...]
     cells: tuple[EstimatorCell, ...]
 
-    def resolved(self) -> dict[str, Any]:
-        """Return the content of `study.json`: the study with every default written out."""
-        study = self.study
-        same = ("name", "question", "seeds", "laps", "estimators", "varied", "metrics")
-        return {
-            "format": "pathspace-study/1",
-            **{name: getattr(study, name) for name in same},
-            "tracks": [{"name": track.name, "digest": track_digest(track)} for track in self.tracks],
-            "logs": {track: [folder.name for folder in folders] for track, folders in study.logs.items()},
-            "noise": {name: asdict(study.simulation(name)) for name in study.noise},
-            "variants": {name: asdict(variant.settings) for name, variant in study.points.items()},
-            "parameters": {
-                name: {of: asdict(own) for of, own in variant.parameters}
-                for name, variant in study.points.items()
-                if variant.parameters
-            },
-            "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
-        }
-
 
 def make_plan(study: Study, *, keep: bool = False) -> Plan:
     """Read and generate the tracks, and return the cells, grouped by the log that they share.
@@ -592,17 +573,32 @@ def run_records(
     one study at a time, of one name; the study may have changed: cells are used wherever they mean the same.
     """
     check_target(out, STUDY_FILE, force=True)
-    file = out / STUDY_FILE
+    study, file = plan.study, out / STUDY_FILE
     if file.is_file():
         try:
             found = read_json(file, "a study")
         except InputError as error:
             raise OutputError(str(error)) from error
         name = found.get("name") if isinstance(found, dict) else None
-        if name != plan.study.name:
-            raise OutputError(f"{file}: expected the study {plan.study.name}, found {shown(name)}")
+        if name != study.name:
+            raise OutputError(f"{file}: expected the study {study.name}, found {shown(name)}")
+    same = ("name", "question", "seeds", "laps", "estimators", "varied", "metrics")
+    resolved = {  # the study with every default written out
+        "format": "pathspace-study/1",
+        **{name: getattr(study, name) for name in same},
+        "tracks": [{"name": track.name, "digest": track_digest(track)} for track in plan.tracks],
+        "logs": {track: [folder.name for folder in folders] for track, folders in study.logs.items()},
+        "noise": {name: asdict(study.simulation(name)) for name in study.noise},
+        "variants": {name: asdict(variant.settings) for name, variant in study.points.items()},
+        "parameters": {
+            name: {of: asdict(own) for of, own in variant.parameters}
+            for name, variant in study.points.items()
+            if variant.parameters
+        },
+        "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
+    }
     with workers(jobs, cluster), locked(out):
-        write_json(file, plan.resolved(), indent=1)
+        write_json(file, resolved, indent=1)
         return run_cells(plan.cells, out, on_cell=on_cell, retry_failed=retry_failed)
 
 

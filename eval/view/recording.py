@@ -5,6 +5,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -159,9 +160,38 @@ class Recorder:
         self._last_pose: Array | None = None
         self._last_health = Health()
         self._closed = False
-        self._set_styles()
+        keep = partial(stream.log, static=True)
+        lines, points = rerun.LineStrips2D, rerun.Points2D
+        sides = drawing.BOUNDARY_COLORS.items()
+        pale = [(label, to_hex(0.5 + 0.5 * np.array(to_rgb(color)))) for label, color in sides]
+        styles = [  # kind, entity, colour, radius and order of drawing
+            *((lines, _path(k, "curve"), color, 1.5, MIDDLE) for k, color in sides),
+            *((lines, _path(k, "tentative"), color, 1.0, MIDDLE) for k, color in sides),
+            *((lines, _path(k, "band"), color, 0.7, LOW) for k, color in pale),
+            *((points, _path(k, "points"), color, 2.0, MIDDLE) for k, color in sides),
+            (points, _path(labels.ORANGE, "points"), RED, 2.0, MIDDLE),
+            (points, _path(labels.BIG_ORANGE, "points"), RED, 3.0, MIDDLE),
+            (lines, TRAJECTORY, GREEN, 0.7, MIDDLE),
+            (lines, WINDOW, GREEN, 2.0, HIGH),
+            (lines, VEHICLE, "#000000", 1.5, TOP),
+            (lines, FEET, DARK, 0.7, HIGH),
+            (points, f"{READINGS}/used", DARK, 3.0, TOP),
+            (points, f"{READINGS}/gated", RED, 3.0, TOP),
+            (points, f"{READINGS}/detected", GREY, 3.0, TOP),
+            (points, TRUE_CONES, LIGHT, 2.0, LOW),
+        ]
+        # the y axis of a two-dimensional view points down, as that of a picture does
+        keep(MAP, rerun.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
+        for kind, path, color, radius, order in styles:
+            radii = [rerun.Radius.ui_points(radius)]
+            keep(path, kind.from_fields(colors=[_rgb(color)], radii=radii, draw_order=order))
+        for path, color in _SERIES.items():
+            name = path.rpartition("/")[2]
+            keep(path, rerun.SeriesLines(colors=[_rgb(color)], names=[name], widths=[1.0]))
+        colors = [_rgb(drawing.HEALTH_COLORS.get(condition, GREEN)) for condition in CONDITIONS]
+        keep(HEALTH, rerun.StateConfiguration(values=list(CONDITIONS), colors=colors))
         if truth is not None and len(truth.cones):
-            self._log_static(TRUE_CONES, rerun.Points2D(truth.cones))
+            keep(TRUE_CONES, rerun.Points2D(truth.cones))
 
     def __call__(self, cycle: ObservedCycle) -> None:
         rerun, log, pose = self._rerun, self._stream.log, np.asarray(cycle.result.pose, float)
@@ -195,41 +225,6 @@ class Recorder:
             if np.isfinite(value):
                 log(path, rerun.Scalars(value))
         self._show_messages(cycle)
-
-    def _set_styles(self) -> None:
-        rerun = self._rerun
-        lines, points = rerun.LineStrips2D, rerun.Points2D
-        sides = drawing.BOUNDARY_COLORS.items()
-        pale = [(label, to_hex(0.5 + 0.5 * np.array(to_rgb(color)))) for label, color in sides]
-        styles = [  # kind, entity, colour, radius and order of drawing
-            *((lines, _path(k, "curve"), color, 1.5, MIDDLE) for k, color in sides),
-            *((lines, _path(k, "tentative"), color, 1.0, MIDDLE) for k, color in sides),
-            *((lines, _path(k, "band"), color, 0.7, LOW) for k, color in pale),
-            *((points, _path(k, "points"), color, 2.0, MIDDLE) for k, color in sides),
-            (points, _path(labels.ORANGE, "points"), RED, 2.0, MIDDLE),
-            (points, _path(labels.BIG_ORANGE, "points"), RED, 3.0, MIDDLE),
-            (lines, TRAJECTORY, GREEN, 0.7, MIDDLE),
-            (lines, WINDOW, GREEN, 2.0, HIGH),
-            (lines, VEHICLE, "#000000", 1.5, TOP),
-            (lines, FEET, DARK, 0.7, HIGH),
-            (points, f"{READINGS}/used", DARK, 3.0, TOP),
-            (points, f"{READINGS}/gated", RED, 3.0, TOP),
-            (points, f"{READINGS}/detected", GREY, 3.0, TOP),
-            (points, TRUE_CONES, LIGHT, 2.0, LOW),
-        ]
-        # the y axis of a two-dimensional view points down, as that of a picture does
-        self._log_static(MAP, rerun.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
-        for kind, path, color, radius, order in styles:
-            radii = [rerun.Radius.ui_points(radius)]
-            self._log_static(path, kind.from_fields(colors=[_rgb(color)], radii=radii, draw_order=order))
-        for path, color in _SERIES.items():
-            name = path.rpartition("/")[2]
-            self._log_static(path, rerun.SeriesLines(colors=[_rgb(color)], names=[name], widths=[1.0]))
-        colors = [_rgb(drawing.HEALTH_COLORS.get(condition, GREEN)) for condition in CONDITIONS]
-        self._log_static(HEALTH, rerun.StateConfiguration(values=list(CONDITIONS), colors=colors))
-
-    def _log_static(self, path: str, what: Any) -> None:
-        self._stream.log(path, what, static=True)
 
     def _lines(self, path: str, strips: list[Array]) -> None:
         self._stream.log(path, self._rerun.LineStrips2D.from_fields(strips=strips))
