@@ -111,8 +111,9 @@ def test_the_angle_of_a_turned_sensor_is_told(turn: float) -> None:
     assert ("to the left" in found.likely) == (turn > 0.0)
 
 
-def test_the_place_of_a_sensor_is_told() -> None:
-    (found,) = hints(in_frame(short_drive(), ahead=2.5, left=-1.0))
+@pytest.mark.parametrize("turn", [0.0, 0.5 * np.pi])
+def test_the_place_of_a_sensor_is_told(turn: float) -> None:
+    *_, found = hints(in_frame(short_drive(), turn=turn, ahead=2.5, left=-1.0))
     assert found.cause == "mounting" and "whose origin is not the vehicle's" in found.likely
     words = found.advice.split()
     assert [float(words[1]), float(words[5].strip(","))] == pytest.approx([2.5, -1.0], abs=0.4)

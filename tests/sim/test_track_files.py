@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.errors import InputError
+from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.labels import BIG_ORANGE
 from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_files import driving_order, read_track
@@ -92,6 +93,17 @@ def test_open_lane_with_duplicates_gate_and_marks(tmp_path: Path) -> None:
     np.testing.assert_allclose(track.right[:, 0], np.arange(-5.0, 30.0, 5.0))
     assert len(track.other) == 2
     assert track.centre_line.length == pytest.approx(30.0, abs=0.1)
+
+
+def test_without_a_start_it_is_between_the_first_blue_cone_and_its_opposite(tmp_path: Path) -> None:
+    """The lane leads along 0.3 rad."""
+    lane, turn = np.arange(0.0, 40.0, 5.0), rotation(0.3)
+    sides = {
+        tag: np.column_stack([lane, 0.0 * lane + y]) @ turn.T for tag, y in (("blue", 2), ("yellow", -2))
+    }
+    rows = [f"{tag},{x},{y},0" for tag, side in sides.items() for x, y in side.tolist()]
+    (tmp_path / "t.csv").write_text("\n".join(["tag,x,y,direction", *rows]))
+    np.testing.assert_allclose(read_track(tmp_path / "t.csv").start, [0.0, 0.0, 0.3], atol=1e-9)
 
 
 def square_yaml(**replaced: str) -> str:

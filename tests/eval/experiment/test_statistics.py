@@ -178,6 +178,7 @@ def test_tables_tell_the_same_in_every_form(frame: pd.DataFrame) -> None:
     tables, told = summary_tables(STUDY, frame), caption(STUDY, frame)
     assert [table.title for table in tables] == ["rmse [m]", "missed [%]", "size"]
     assert len(tables[0].frame) == 6
+    assert tables[0].records()[1]["Wilcoxon"] == "0.125"  # of four tracks that differ alike: 2 / 2^4
     assert "Holm" in told
     assert "paired" in told
     text, markdown, latex = (joined(tables, told, form) for form in ("txt", "md", "tex"))
