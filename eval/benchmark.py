@@ -21,7 +21,7 @@ from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.console import progress
-from pathspace_graph.estimators import make_online
+from pathspace_graph.estimators import make_online, module_of
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.se2 import compose, left_of, to_map
@@ -36,13 +36,11 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track, along_polyline, arc_lengths, unit
 from pathspace_graph.sim.vehicle import VehicleSettings
 
-from .experiment.provenance import code_of
-from .experiment.run import rows_of
+from .experiment.run import code_from, rows_of
 from .experiment.tables import TextTable, write_csv
-from .figures import style
+from .figures import drawing
 from .metrics.accuracy import mean_of
-from .metrics.measures import UNKNOWN, Metric, figure, figures
-from .metrics.summary import lap_times, versions
+from .metrics.measures import UNKNOWN, Metric, figure, figures, lap_times, versions
 
 # --- beside ISAM2 ----------------------------------------------------------------------------------------
 
@@ -316,7 +314,8 @@ def measure_scaling(
     """Return the points of all sweeps, which are kept in a folder; `how` is that of `rows_of`."""
     same = {"estimators": tuple(estimators), "settings": settings, "mapper": mapper or MapperSettings()}
     sweeps = [{"sweep": sweep, **same} for sweep in (CONES, READINGS, LAPS, DENSE_LINE)]
-    return rows_of(sweep_points, sweeps, folder, depends=[code_of(name) for name in estimators], **how)
+    depends = [code_from(module_of(name)) for name in estimators]
+    return rows_of(sweep_points, sweeps, folder, depends=depends, **how)
 
 
 # --- tables and files of the sweeps ----------------------------------------------------------------------
@@ -388,16 +387,16 @@ def write_scaling(
         write_csv(folder / "points.csv", points)
         scaling_table(points, settings).write(folder, "table", "md")
         write_json(folder / MARKER, content)
-        style.save_figures(folder, {"scaling": plot_scaling(points)})
+        drawing.save_figures(folder, {"scaling": plot_scaling(points)})
 
 
 def plot_scaling(points: pd.DataFrame) -> Figure:
     """Draw update times against map size and against detections, on logarithmic axes."""
     titles = {CONES: ("cones seen", "(a) map size"), READINGS: ("detections per update", "(b) detections")}
-    names, looks = points["estimator"].unique(), zip(cycle(style.PALETTE), cycle(style.MARKERS), strict=True)
-    look_of = dict(zip(names, looks, strict=False))
-    with style.figure_context():
-        drawn = Figure(figsize=(style.WIDTH, 3.1), layout="constrained")
+    looks = zip(cycle(drawing.PALETTE), cycle("os^Dv*<>PXphd"), strict=True)
+    look_of = dict(zip(points["estimator"].unique(), looks, strict=False))
+    with drawing.figure_context():
+        drawn = Figure(figsize=(drawing.WIDTH, 3.1), layout="constrained")
         panels = drawn.subplots(1, 2, sharey=True)
         for axes, (sweep, (abscissa, title)) in zip(panels, titles.items(), strict=True):
             for name, (color, marker) in look_of.items():
@@ -407,5 +406,5 @@ def plot_scaling(points: pd.DataFrame) -> Figure:
             axes.set(xlabel=abscissa, title=title)
             axes.grid(which="both")
         panels[0].set_ylabel("mean update [ms]")
-        style.shared_legend(drawn)
+        drawing.shared_legend(drawn)
     return drawn

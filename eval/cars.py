@@ -14,11 +14,9 @@ import numpy as np
 import pandas as pd
 from scipy.special import expit
 
-from pathspace_graph.batch.joint import join
-from pathspace_graph.batch.known_map import KnownMap, map_of_cones
+from pathspace_graph.batch import joint as several
+from pathspace_graph.batch import known_map, simplification, start
 from pathspace_graph.batch.mapper import BatchResult
-from pathspace_graph.batch.simplification import own_settings
-from pathspace_graph.batch.start import all_detections
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE, make_batch, make_online, settings_of
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import compose, inverse, path_lengths
@@ -39,9 +37,8 @@ from pathspace_graph.sim.track_generator import generate_track
 from .experiment.run import CELLS, run_study
 from .experiment.study import Study
 from .experiment.tables import TextTable, by_name, estimate, last_laps
-from .metrics.accuracy import lap_metrics, root_mean_square
+from .metrics.accuracy import consistency_at_cones, lap_metrics, map_nees, root_mean_square
 from .metrics.alignment import aligned_distance, end_by_registration, maps_apart, motion_onto, shape_rmse
-from .metrics.consistency import consistency_at_cones, map_nees
 from .metrics.measures import METRICS, UNKNOWN, Metric, figure, figures
 from .metrics.reference import truth_of
 from .metrics.trajectory import interpolate_poses, position_rms, trajectory_errors
@@ -71,7 +68,6 @@ def simulated(car: str, track: int, seed: int) -> Log:
 OWN, OTHER = "another drive's", "another track's"
 SIGMA_SURVEY: Final = 0.15  # of the cones of a surveyed map (m)
 SOON: Final = 8.0  # time after which the vehicle should be found (s)
-DRIVEN: Final = 40.0  # time that is driven on a known map (s)
 WRONG: Final = 2.0  # distance (m) from the true pose at which the place where it was found is a wrong one
 
 
@@ -113,15 +109,15 @@ def surveyed(truth: Truth, rng: np.random.Generator, moved: int = 0) -> Map:
     if moved:
         outwards = cones[LEFT][chosen] - middle
         cones[LEFT][chosen] += 2.5 * outwards / np.hypot(*outwards.T)[:, None]
-    return map_of_cones(cones[LEFT], cones[RIGHT], True, SIGMA_SURVEY)
+    return known_map.map_of_cones(cones[LEFT], cones[RIGHT], True, SIGMA_SURVEY)
 
 
 def begun_later(log: Log, share: float) -> Log:
-    """Return a log from a share of its first half's time on, without truth, which is in another frame."""
+    """Return 40 s of a log from a share of its first half's time on, without truth: its frame is another."""
     t = log.odometry.t
     begin = float(t[0] + 0.5 * share * (t[-1] - t[0]))
     later = log.odometry.between(begin, float(t[-1]))
-    cycles = tuple(cycle for cycle in log.cycles if later.t[0] < cycle.t < begin + DRIVEN)
+    cycles = tuple(cycle for cycle in log.cycles if later.t[0] < cycle.t < begin + 40.0)
     return replace(log, odometry=later, cycles=cycles, truth=None)
 
 
@@ -160,14 +156,14 @@ def odds_of_track(car: str, track: int) -> list[dict[str, Any]]:
     """
     first, log = (simulated(car, track, seed) for seed in (0, 1))
     settings = settings_of(MapperSettings(), log)
-    judged = judge_log(log, known_noise(log.noise), own_settings(settings))
+    judged = judge_log(log, known_noise(log.noise), simplification.own_settings(settings))
     poses, truth = judged.chain.dead_reckoned(judged.chain.calibration_mean), truth_of(log)
     motion = motion_onto(truth.cones, truth_of(first).cones)
     true = compose(motion, interpolate_poses(truth.pose_t, truth.poses, judged.chain.stamps))
-    table, driven, rows = all_detections(judged), path_lengths(poses), list[dict[str, Any]]()
+    table, driven, rows = start.all_detections(judged), path_lengths(poses), list[dict[str, Any]]()
     due = np.arange(20.0, driven[-1], 10.0)
     for kind, other in ((OWN, first), (OTHER, simulated(car, track + 1000, 0))):
-        known = KnownMap.of(mapped(other), False, settings.of_lines)
+        known = known_map.KnownMap.of(mapped(other), False, settings.of_lines)
         road = KnownRoad.of(known.splines, known.cones)
         for newest in np.unique(driven.searchsorted(due)).tolist():
             lately = np.flatnonzero(driven[: newest + 1] > driven[newest] - STRETCH)
@@ -223,7 +219,7 @@ def metrics_of_group(logs: Mapping[str, Log], alone: Mapping[str, BatchResult]) 
     first, mapped = next(iter(logs)), {name: alone[name] for name in logs}
     own = mapped
     if len(logs) > 1:
-        joint = join(mapped)
+        joint = several.join(mapped)
         first, mapped = next(iter(joint.drives)), joint.drives
         own = {name: drive.moved(inverse(joint.frames[name])) for name, drive in mapped.items()}
     track, truths = mapped[first].map, {name: truth_of(logs[name]) for name in mapped}
@@ -298,7 +294,7 @@ def maps_table(runs: pd.DataFrame, cells: Path) -> TextTable:
 def real_joint_table(logs: Mapping[str, Log]) -> TextTable:
     """Return how far each drive's own batch is from that of all drives, and both from the last pose."""
     alone = {name: solve_alone(log) for name, log in logs.items()}
-    joint, rows = join(alone), []
+    joint, rows = several.join(alone), []
     for name, together in joint.drives.items():
         apart = maps_apart(alone[name].map, together.map).statistics()["both"]
         pose = compose(inverse(joint.frames[name]), together.trajectory[-1])

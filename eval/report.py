@@ -23,20 +23,10 @@ from pathspace_graph.sim.track_generator import generate_track
 
 from . import cars
 from .benchmark import QUICK, RIVAL, SPEED, measure_scaling, scaling_table, speed_on
-from .experiment.faults import at_strength, fault_table, kinds, only, outcomes
-from .experiment.provenance import origin_of
-from .experiment.run import make_plan, rows_of, run_study
+from .experiment import faults, tables
+from .experiment.run import make_plan, origin_of, rows_of, run_study
 from .experiment.study import Study, StudyDrive, find_study, read_study_file
-from .experiment.tables import (
-    RUN_OF,
-    TextTable,
-    by_metric,
-    by_name,
-    contrast_table,
-    last_laps,
-    mean,
-    write_csv,
-)
+from .experiment.tables import TextTable, by_metric, by_name, last_laps
 from .metrics.measures import METRICS, UNKNOWN, Metric
 from .metrics.reference import landmark_rmse, solve_oracle_landmarks, truth_of
 
@@ -44,9 +34,7 @@ FILE: Final = Path(__file__).with_suffix(".toml")
 STUDIES: Final = parse_toml(read_text(FILE), FILE)
 QUICKEST: Final = ("accuracy", "skidpad", "camera", "faults", "robust", "speed", "scale")
 """Experiments of a quick report: the others have no table of their own kind."""
-Tables = dict[
-    str, TextTable
-]  # tables of an experiment, by what follows its name; empty for the one of that name
+Tables = dict[str, TextTable]  # of an experiment, by what follows its name; empty for the one of that name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +59,8 @@ class ReportPlan:
         if folder.name == "accuracy" and not self.quick:
             study = replace(study, tracks=(*study.tracks, *self.tracks))
         if folder.name == "faults":
-            study = at_strength(study, 0.5)
-            study = only(study, kinds(study)[:1]) if self.quick else study
+            study = faults.at_strength(study, 0.5)
+            study = faults.only(study, faults.kinds(study)[:1]) if self.quick else study
         if self.quick:
             grids = tuple({key: values[:1] for key, values in grid.items()} for grid in study.grids[:1])
             study = replace(study, grids=grids, variants=dict([*study.variants.items()][:1]))
@@ -90,7 +78,9 @@ class ReportPlan:
         if folder.name == "camera":
             drives = dict.fromkeys(cell.drive for cell in make_plan(study).cells)
             parts = [{"drive": drive} for drive in drives]
-            limit = mean(METRICS["rmse"], rows_of(landmark_limit, parts, folder / "landmarks", **self.how))
+            limit = tables.mean(
+                METRICS["rmse"], rows_of(landmark_limit, parts, folder / "landmarks", **self.how)
+            )
             frame = found[""].frame
             frame.loc[len(frame)] = ["landmarks, given all", limit, *[UNKNOWN] * (frame.shape[1] - 2)]
         return found
@@ -104,9 +94,8 @@ class ReportPlan:
         tracks, begins = ((60,), (0.3,)) if self.quick else (range(60, 68), (0.0, 0.3, 0.6))
         parts = cars.on_tracks(tracks, begins=begins)
         drives = rows_of(cars.known_of_track, parts, folder, **self.how)
-        searches = rows_of(
-            cars.odds_of_track, cars.on_tracks(tracks, [*cars.CARS]), folder / "odds", **self.how
-        )
+        every = cars.on_tracks(tracks, [*cars.CARS])
+        searches = rows_of(cars.odds_of_track, every, folder / "odds", **self.how)
         return {"": cars.known_table(drives), "odds": cars.odds_table(searches)}
 
     def speed(self, _: Path) -> Tables:
@@ -171,7 +160,7 @@ def write_report(
         }
         for part, table in EXPERIMENTS[name](plan, folder / name).items():
             file = folder / f"{'_'.join(filter(None, (name, part)))}.csv"
-            write_csv(file, table.tidy.assign(**about))
+            tables.write_csv(file, table.tidy.assign(**about))
             yield file, table
 
 
@@ -227,7 +216,7 @@ def rmse_table(_: Study, frame: pd.DataFrame) -> TextTable:
     several = laps.groupby("estimator", sort=False)["lap"].transform("nunique") > 1
     texts = pd.DataFrame(
         {
-            name: {lap: mean(METRICS["rmse"], of) for lap, of in runs.groupby("lap")}
+            name: {lap: tables.mean(METRICS["rmse"], of) for lap, of in runs.groupby("lap")}
             for name, runs in laps[several].groupby("estimator", sort=False)
         }
     )
@@ -237,7 +226,7 @@ def rmse_table(_: Study, frame: pd.DataFrame) -> TextTable:
 
 def skidpad_table(_: Study, frame: pd.DataFrame, metrics: Sequence[Metric]) -> TextTable:
     """Return every estimator: its trajectory error over the whole drive, and its map at the end."""
-    square = (frame["ate"] ** 2).groupby([frame[name] for name in RUN_OF]).transform("mean")
+    square = (frame["ate"] ** 2).groupby([frame[name] for name in tables.RUN_OF]).transform("mean")
     return by_name(last_laps(frame.assign(ate=square**0.5)), ("estimator",), metrics)
 
 
@@ -247,8 +236,8 @@ KINDS: Final[Mapping[str, Callable[..., TextTable]]] = {
     "tracks": tracks_table,
     "rmse": rmse_table,
     "skidpad": skidpad_table,
-    "differences": contrast_table,
+    "differences": tables.contrast_table,
     "runs": lambda _, frame, names, metrics: by_name(last_laps(frame), names, metrics),
-    "faults": lambda study, frame: fault_table(study, outcomes(study, frame)),
+    "faults": lambda study, frame: faults.fault_table(study, faults.outcomes(study, frame)),
 }
 """Tables of a study and its results, with options."""

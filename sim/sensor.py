@@ -23,9 +23,6 @@ from .track import STEP, SmoothCurve, Track, arc_lengths, direction, ring
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-FALSE_POSITIVE: Final = -1  # association of a detection that is of no cone
-CAMERAS: Final = 2  # cameras that may see a cone at once
-
 
 @dataclass(frozen=True)
 class OdometryNoise(Checked, group="odometry"):
@@ -86,12 +83,6 @@ class SensorSettings(Checked):
     sigma_range_scale: AtLeast0 = 0.0005
     """Standard deviation of the scale error of the ranges (-) that the log states, as of a calibrated sensor;
     with 0 it states none."""
-    range_bias: bool = False
-    """Whether ranges have a systematic error, as those of cameras do."""
-    range_bias_at: tuple[float, ...] = (4.0, 9.0)
-    """Increasing ranges of the given systematic errors (m), which are linear between them."""
-    range_bias_values: tuple[float, ...] = (0.02, 0.34)
-    """Systematic errors at those ranges (m), typical of cameras."""
     range_bend: Signed = 0.0
     """Bend k of the ranges (1/m): a range r reads `k (r - range_bend_from)^2` longer beyond that range."""
     range_bend_from: AtLeast0 = 9.0
@@ -120,10 +111,6 @@ class SensorSettings(Checked):
         least, greatest = self.overlap
         if not 0.0 <= least < greatest:
             raise SettingsError(f"sensor.overlap: expected 0 <= least < greatest, found {self.overlap}")
-        at, values = self.range_bias_at, self.range_bias_values
-        if len(at) != len(values) or not np.all(np.diff(at) > 0):
-            expected = "expected increasing ranges, one for each of range_bias_values"
-            raise SettingsError(f"sensor.range_bias_at: {expected}")
 
     def range_sigmas(self, ranges: Array) -> Array:
         return self.range_sigma + self.range_sigma_growth * ranges
@@ -136,12 +123,9 @@ class SensorSettings(Checked):
         """Probabilities of detection at true ranges (m,)."""
         return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
 
-    def systematic_errors(self, ranges: Array) -> Array:
-        """Systematic errors (m,) of true ranges (m,), in m."""
-        biased = self.range_bias and len(self.range_bias_at) > 0
-        errors = np.interp(ranges, self.range_bias_at, self.range_bias_values) if biased else 0.0
-        beyond = np.maximum(ranges - self.range_bend_from, 0.0)
-        return np.asarray(errors + self.range_bend * beyond**2)
+    def bent(self, ranges: Array) -> Array:
+        """Lengths (m,) by which true ranges (m,) are read too long, in m."""
+        return np.asarray(self.range_bend * np.maximum(ranges - self.range_bend_from, 0.0) ** 2)
 
 
 def measure_twists(twists: Array, dt: float, noise: OdometryNoise, rng: Generator) -> tuple[Array, Array]:
@@ -181,8 +165,8 @@ class Sensor(ABC):
         """Detect a cycle from a pose [x, y, theta], where a range r reads `(1 + scale) r + bias`.
 
         The second result is the true cone of each detection (m,), or the nearest true point of a line. Each
-        covariance is that of the noise of range and bearing, and of the scatter. Detections of nothing are
-        uniform over the area of the field, with either boundary's label.
+        covariance is that of the noise of range and bearing, and of the scatter. Detections of nothing have
+        the cone -1, and are uniform over the area of the field, with either boundary's label.
         """
         settings, rng = self._settings, self._false_rng
         count = int(rng.poisson(settings.false_positives))
@@ -190,7 +174,7 @@ class Sensor(ABC):
             np.sqrt(rng.uniform(settings.range_min**2, settings.range_max**2, count)),
             rng.uniform(-settings.fov / 2, settings.fov / 2, count),
             rng.integers(LEFT, RIGHT, count, endpoint=True),
-            np.full(count, FALSE_POSITIVE),
+            np.full(count, -1),
             np.zeros((count, 2)),
         )
         parts = zip(self._see(pose, scale, bias), false, strict=True)
@@ -210,7 +194,8 @@ class ConeSensor(Sensor):
         count = round(settings.blind_fraction * len(cones))
         self.blind: IntArray = np.sort(blind_rng.permutation(len(cones))[:count])
         self._seen = np.setdiff1d(np.arange(len(cones)), self.blind)
-        self._slow = self._slow_rng.standard_normal((CAMERAS, 2, len(cones)))
+        # of both cameras that may see a cone at once, along the ray and of the bearing
+        self._slow = self._slow_rng.standard_normal((2, 2, len(cones)))
 
     def _see(self, pose: Array, scale: float, bias: float) -> tuple[Array, Array, IntArray, IntArray, Array]:
         settings, rng = self._settings, self._cone_rng
@@ -227,25 +212,21 @@ class ConeSensor(Sensor):
         hit = chance < settings.probabilities(ranges)
         overlap = np.digitize(np.abs(bearings), settings.overlap) == 1
         rows = np.stack([hit, hit & overlap & (again < settings.duplicates)])
-        ranges = (1.0 + scale) * ranges + bias + settings.systematic_errors(ranges)
-        errors = self._errors(np.stack([first, second]), cones)
-        ranges = ranges + settings.range_sigmas(ranges) * errors[:, 0]
-        bearings = bearings + settings.bearing_sigma * errors[:, 1]
-        index = np.nonzero(rows)[1]
-        return ranges[rows], bearings[rows], labels[index], cones[index], np.zeros((len(index), 2))
-
-    def _errors(self, white: Array, cones: IntArray) -> Array:
-        """Errors (2, 2, m) of unit variance by camera, range or bearing, and cone.
-
-        Each cone's slow errors are Gauss-Markov processes that go on while it is not seen.
-        """
-        settings = self._settings
-        share = np.array([settings.slow_range, settings.slow_bearing])[:, None]
+        ranges = (1.0 + scale) * ranges + bias + settings.bent(ranges)
+        # errors (2, 2, m) of unit variance by camera, range or bearing, and cone; each cone's slow ones are
+        # Gauss-Markov processes that go on while it is not seen
+        share, white = (
+            np.array([settings.slow_range, settings.slow_bearing])[:, None],
+            np.stack([first, second]),
+        )
         errors = np.sqrt(1.0 - share) * white + np.sqrt(share) * self._slow[:, :, cones]
         rho = np.exp(-1.0 / (settings.rate * settings.slow_time))
         drawn = self._slow_rng.standard_normal(self._slow.shape)
         self._slow = rho * self._slow + np.sqrt(1.0 - rho**2) * drawn
-        return np.asarray(errors)
+        ranges = ranges + settings.range_sigmas(ranges) * errors[:, 0]
+        bearings = bearings + settings.bearing_sigma * errors[:, 1]
+        index = np.nonzero(rows)[1]
+        return ranges[rows], bearings[rows], labels[index], cones[index], np.zeros((len(index), 2))
 
 
 # --- points of lines, at different places in each cycle ----------------------------------------------------
@@ -260,9 +241,7 @@ class LineSettings(Checked, group="line"):
     sigma_across: AtLeast0 = 0.0
     """Standard deviation of a point across its boundary beside the noise of range and bearing (m)."""
     gaps: Annotated[int, Meta(ge=0, description="a whole number of at least 0")] = 0
-    """Number of stretches of a boundary in which nothing is detected, drawn once for a log."""
-    gap_length: AtLeast0 = 10.0
-    """Length of each of them (m)."""
+    """Number of stretches of 10 m of a boundary in which nothing is detected, drawn once for a log."""
 
 
 LINE: Final = SensorSettings(
@@ -326,13 +305,22 @@ class LineSensor(Sensor):
 
     def _see(self, pose: Array, scale: float, bias: float) -> tuple[Array, Array, IntArray, IntArray, Array]:
         settings, rng = self._settings, self._noise_rng
-        points, normals, nearest = self._draw()
+        drawn = []  # points of both boundaries, with their normals and the nearest true points
+        for side, curve in enumerate(self._curves):
+            count = int(self._place_rng.poisson(curve.length / self._line.spacing))
+            s = self._place_rng.uniform(0.0, curve.length, count)
+            for gap_side, begin in self.gaps:
+                beyond = (s - begin) % curve.length if curve.closed else s - begin
+                s = s[(side != gap_side) | (beyond < 0.0) | (beyond >= 10.0)]
+            index = np.rint(s / curve.length * self._counts[side]).astype(int) % self._counts[side]
+            drawn.append((curve.points(s), curve.normals(s), index + side * self._counts[0]))
+        points, normals, nearest = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
         chance, colour = rng.random((2, len(points)))
         along, bearing, across = rng.standard_normal((3, len(points)))
         points = points + normals * (self._line.sigma_across * across)[:, None]
         ranges, bearings = seen_from(pose, points)
         seen = settings.is_inside(ranges, bearings) & (chance < settings.probabilities(ranges))
-        ranges = (1.0 + scale) * ranges + bias + settings.systematic_errors(ranges)
+        ranges = (1.0 + scale) * ranges + bias + settings.bent(ranges)
         ranges = ranges + settings.range_sigmas(ranges) * along
         bearings = bearings + settings.bearing_sigma * bearing
         labels = self._labels[nearest]
@@ -341,18 +329,3 @@ class LineSensor(Sensor):
         vehicle = np.column_stack([ahead, left_of(ahead)])  # turns rows of the map frame into it
         scatter = self._line.sigma_across * normals[seen] @ vehicle
         return ranges[seen], bearings[seen], labels[seen], nearest[seen], scatter
-
-    def _draw(self) -> tuple[Array, Array, IntArray]:
-        """Draw points (m, 2) of both boundaries, with their normals and the nearest true points (m,)."""
-        drawn = []
-        for side, curve in enumerate(self._curves):
-            count = int(self._place_rng.poisson(curve.length / self._line.spacing))
-            s = self._place_rng.uniform(0.0, curve.length, count)
-            for gap_side, begin in self.gaps:
-                beyond = (s - begin) % curve.length if curve.closed else s - begin
-                s = s[(side != gap_side) | (beyond < 0.0) | (beyond >= self._line.gap_length)]
-            share = s / curve.length
-            nearest = np.rint(share * self._counts[side]).astype(int) % self._counts[side]
-            drawn.append((curve.points(s), curve.normals(s), nearest + side * self._counts[0]))
-        points, normals, index = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
-        return points, normals, index

@@ -273,10 +273,10 @@ def skidpad() -> Track:
     lanes = [(side * at, y) for at in x for side in (1, -1) for y in (-LANE / 2, LANE / 2)]
     rounds = np.arange(0.0, 4 * np.pi, STEP / middle)
     path = [
-        _line(-approach, 0.0),
+        np.arange(-approach, 0.0, STEP)[:, None] * [1.0, 0.0],
         _circle(middle, rounds) + below,
         _circle(middle, rounds) * mirrored + above,
-        _line(0.0, approach),
+        np.arange(0.0, approach, STEP)[:, None] * [1.0, 0.0],
     ]
     return Track(
         left=np.concatenate([outer_row + below, inner * mirrored + above]),
@@ -292,10 +292,6 @@ def skidpad() -> Track:
 
 def _circle(radius: float, angles: Array) -> Array:
     return radius * np.column_stack([np.sin(angles), np.cos(angles)])
-
-
-def _line(begin: float, end: float) -> Array:
-    return np.arange(begin, end, STEP)[:, None] * [1.0, 0.0]
 
 
 def acceleration() -> Track:

@@ -11,15 +11,13 @@ from typing import Annotated, Any, Final
 import numpy as np
 import scipy  # which imports its modules when they are used
 from msgspec import Meta, Struct, field
-from numpy.typing import NDArray
 
 from pathspace_graph.errors import InputError
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import left_of
 from pathspace_graph.io.parsing import MAX_COORDINATE, Table, is_number, parse_yaml, read_text, shown, typed
 from pathspace_graph.io.tables import read_table
-from pathspace_graph.labels import BIG_ORANGE, UNKNOWN, label_from_name
-from pathspace_graph.labels import ORANGE as SMALL_ORANGE
+from pathspace_graph.labels import BIG_ORANGE, ORANGE, UNKNOWN, label_from_name
 
 from .track import Track, arc_lengths, direction, resample, ring, unit
 
@@ -29,7 +27,6 @@ MAX_TRACK_WIDTH: Final = 100.0  # m, from the middle of a track to a boundary
 MAX_CONES: Final = 6_000  # of each boundary of a track
 MIN_CONES: Final = 3  # least number of cones of a boundary
 REPEAT_DISTANCE: Final = 0.01  # distance below which a cone of an ordered row is the one before again (m)
-ORANGE: Final = "orange"  # part of PacSim's classes of cones of no boundary
 WIDTH_STEP: Final = 0.5  # distance of samples of a circuit (m)
 TUM_COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")  # centre line and widths
 EUFS_OTHER: Final = ("orange", "big_orange", "unknown", "unknown_color")
@@ -149,8 +146,8 @@ def _pacsim(path: Path, content: Any) -> Track:
     points = _points([cone.position for cones in lists for cone in cones])
     kinds = np.array([str(cone.kind) for cones in lists for cone in cones], str)
     row = np.repeat(np.arange(3), [*map(len, lists)])  # of which list: of no boundary, left or right
-    orange = np.char.find(kinds, ORANGE) >= 0
-    labels = np.where(np.char.find(kinds, "big") >= 0, BIG_ORANGE, SMALL_ORANGE)
+    orange = np.char.find(kinds, "orange") >= 0  # cones of no boundary
+    labels = np.where(np.char.find(kinds, "big") >= 0, BIG_ORANGE, ORANGE)
     labels = np.where(orange, labels, UNKNOWN)
     left, right = (_without_repeats(points[(row == k) & ~orange], data.closed) for k in (1, 2))
     start = np.array([*data.start.position[:2], data.start.orientation[2]])
@@ -163,7 +160,7 @@ def _fssim(path: Path, content: Any) -> Track:
     left, right = (_without_repeats(_points(row), closed=True) for row in (data.cones_left, data.cones_right))
     small, big = _points(data.cones_orange), _points(data.cones_orange_big)
     start = np.array(data.starting_pose_front_wing[:3])
-    kinds = np.repeat([SMALL_ORANGE, BIG_ORANGE], [len(small), len(big)])
+    kinds = np.repeat([ORANGE, BIG_ORANGE], [len(small), len(big)])
     return Track(left, right, np.concatenate([small, big]), True, start, path.stem, kinds)
 
 
@@ -195,7 +192,17 @@ def _eufs(table: Table) -> Track:
     for tag, cones in (("blue", left), ("yellow", right)):
         if len(cones) < MIN_CONES:
             raise InputError(path, f"expected at least {MIN_CONES} {tag} cones, found {len(cones)}")
-    start = _eufs_start(table, tags, points, left, right)
+    rows = np.flatnonzero(tags == "car_start")[:1]
+    if len(rows):
+        text = table.columns["direction"][rows[0]].strip() if "direction" in table.columns else ""
+        if text and not (is_number(text) and math.isfinite(float(text))):
+            expected = "expected the heading of car_start in column 'direction'"
+            raise InputError(path, f"{expected}, found '{text}'", int(table.rows[rows[0]]))
+        start = np.append(points[rows[0]], float(text or 0.0))
+    else:  # between the first blue cone and its opposite
+        opposite = right[np.argmin(np.linalg.norm(right - left[0], axis=1))]
+        across = left[0] - opposite
+        start = np.append((left[0] + opposite) / 2, math.atan2(-across[0], across[1]))
     order = driving_order(left, right, points[tags == "big_orange"], start)
     count, placed = len(left) + len(right), 0 if order is None else len(order.left) + len(order.right)
     if order is None or placed < 0.8 * count:  # the others are strays
@@ -206,20 +213,6 @@ def _eufs(table: Table) -> Track:
     labels = np.repeat(kinds, [len(cones) for cones in others])
     left, right = left[order.left], right[order.right]
     return Track(left, right, np.concatenate(others), order.closed, start, path.stem, labels)
-
-
-def _eufs_start(table: Table, tags: NDArray[np.str_], points: Array, left: Array, right: Array) -> Array:
-    """Pose of the first `car_start`, or one between the first blue cone and its opposite."""
-    rows = np.flatnonzero(tags == "car_start")[:1]
-    if len(rows):
-        text = table.columns["direction"][rows[0]].strip() if "direction" in table.columns else ""
-        if text and not (is_number(text) and math.isfinite(float(text))):
-            expected = "expected the heading of car_start in column 'direction'"
-            raise InputError(table.file, f"{expected}, found '{text}'", int(table.rows[rows[0]]))
-        return np.append(points[rows[0]], float(text or 0.0))
-    opposite = right[np.argmin(np.linalg.norm(right - left[0], axis=1))]
-    across = left[0] - opposite
-    return np.append((left[0] + opposite) / 2, math.atan2(-across[0], across[1]))
 
 
 def _without_duplicates(cones: Array) -> Array:

@@ -11,18 +11,9 @@ from numpy.typing import NDArray
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import left_of
-from pathspace_graph.settings.checked import AtLeast0, Checked
+from pathspace_graph.settings.checked import Checked
 
-from .track import (
-    SMOOTHING,
-    STEP,
-    Track,
-    along_polyline,
-    arc_lengths,
-    curvature,
-    ring,
-    unit,
-)
+from .track import SMOOTHING, STEP, Track, along_polyline, arc_lengths, curvature, ring, unit
 
 MAX_ATTEMPTS: Final = 500  # two in three keep the default rules; contradicting ones fail them all
 CONE_GAPS: Final = 1.0, 5.0  # least and greatest distance of cones along a row (m)
@@ -40,8 +31,6 @@ class TrackGeneratorSettings(Checked, group="generator"):
     """Least and greatest distance of the boundaries, constant along a track (m); the rules ask for 3."""
     cones: int = 200
     """Cones of both boundaries together, as nearly as the gaps allow."""
-    separation: AtLeast0 = 1.5
-    """Least distance of boundaries of different stretches (m)."""
     corners: tuple[int, int] = (5, 9)
     """Least and greatest number of corners of the layout that the elements are put into."""
     hairpins: tuple[int, int] = (0, 3)
@@ -211,7 +200,7 @@ def _chicane(along: Array, length: float, rng: Generator) -> Array:
 
 
 def _keeps_rules(curve: Array, width: float, settings: TrackGeneratorSettings) -> bool:
-    bend, distance = np.abs(_curvature(curve)), width + settings.separation
+    bend, distance = np.abs(_curvature(curve)), width + 1.5  # m between boundaries of different stretches
     pairs = scipy.spatial.KDTree(curve).query_pairs(distance, output_type="ndarray")
     apart = np.abs(pairs[:, 0] - pairs[:, 1])
     apart = np.minimum(apart, len(curve) - apart) * STEP  # samples that are near are of one stretch

@@ -19,7 +19,7 @@ from .track import SmoothCurve, Track, arc_lengths, curvature, direction
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-WAVES: Final = 8  # number of sines whose sum is the wander
+SETTLING: Final = 5.0  # distance over which the vehicle moves from its start pose to the middle (m)
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,6 @@ class VehicleSettings(Checked):
     """Greatest longitudinal deceleration (m/s^2)."""
     wander: AtLeast0 = 0.3
     """Largest distance of the smooth lateral wander from the middle (m)."""
-    wander_wavelengths: tuple[float, float] = (15.0, 60.0)
-    """Shortest and longest wavelength of the wander (m)."""
-    half_width: AtLeast0 = 0.75
-    """Half the vehicle's width (m), which the wander keeps `margin` away from the cones."""
-    margin: AtLeast0 = 0.25
-    """Distance of the vehicle's side from the cones where the track is wide enough (m)."""
-    settle_distance: float = 5.0
-    """Distance over which the vehicle moves from its start pose to the middle (m)."""
     overrun: Signed = 10.0
     """Distance driven beyond the last lap's end (m); where it is negative, the road stays open."""
     rest: AtLeast0 = 0.0
@@ -54,12 +46,6 @@ class VehicleSettings(Checked):
     """Time for which the vehicle stands at the end of the drive, after braking (s); it drives on if 0."""
     rate: float = 50.0
     """Rate of the odometry and of the true poses (Hz)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        shortest, longest = self.wander_wavelengths
-        if not 0 < shortest <= longest < np.inf:
-            raise SettingsError(f"vehicle.wander_wavelengths: expected 0 < a <= b, found {shortest, longest}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,15 +115,15 @@ def _driven_path(track: Track, laps: int, settings: VehicleSettings, rng: Genera
     normals = line.normals(at)
     period = line.length if line.closed else None
     clearance = np.interp(at, line.spline.x, line.clearance, period=period)
-    offset = _wander(s, clearance, settings, rng) + _settling(line, start, track.start, s, settings)
+    offset = _wander(s, clearance, settings.wander, rng) + _settling(line, start, track.start, s)
     points = line.points(at) + normals * offset[:, None]
-    points += (track.start[:2] - points[0]) * np.exp(-s / settings.settle_distance)[:, None]
+    points += (track.start[:2] - points[0]) * np.exp(-s / SETTLING)[:, None]
     return scipy.interpolate.CubicSpline(
         arc_lengths(points), points, bc_type=((1, direction(track.start[2])), "not-a-knot")
     )
 
 
-def _settling(line: SmoothCurve, start: float, pose: Array, s: Array, settings: VehicleSettings) -> Array:
+def _settling(line: SmoothCurve, start: float, pose: Array, s: Array) -> Array:
     """Lateral offset (n,) that begins with the start pose's offset and slope and dies away."""
     point, tangent = line.points(np.array([start]))[0], line.tangents(np.array([start]))[0]
     normal = left_of(tangent)
@@ -145,17 +131,15 @@ def _settling(line: SmoothCurve, start: float, pose: Array, s: Array, settings: 
     heading = direction(pose[2])
     stretch = 1.0 - line.curvatures(np.array([start]))[0] * offset
     slope = stretch * float(normal @ heading) / float(tangent @ heading)
-    decay = np.exp(-s / settings.settle_distance)
-    return np.asarray((offset + (slope + offset / settings.settle_distance) * s) * decay)
+    return np.asarray((offset + (slope + offset / SETTLING) * s) * np.exp(-s / SETTLING))
 
 
-def _wander(s: Array, clearance: Array, settings: VehicleSettings, rng: Generator) -> Array:
-    shortest, longest = settings.wander_wavelengths
-    wavenumbers = 2 * np.pi * rng.uniform(1 / longest, 1 / shortest, WAVES)
-    phases = rng.uniform(0.0, 2 * np.pi, WAVES)
-    wave = np.sin(s[:, None] * wavenumbers + phases).sum(axis=1) / np.sqrt(WAVES)
-    room = np.clip(clearance - settings.half_width - settings.margin, 0.0, settings.wander)
-    begin = -np.expm1(-((s / settings.settle_distance) ** 2))
+def _wander(s: Array, clearance: Array, most: float, rng: Generator) -> Array:
+    """Draw the lateral wander (n,) by at most so many metres: a sum of eight sines of 15 to 60 m."""
+    wavenumbers, phases = 2 * np.pi * rng.uniform(1 / 60.0, 1 / 15.0, 8), rng.uniform(0.0, 2 * np.pi, 8)
+    wave = np.sin(s[:, None] * wavenumbers + phases).sum(axis=1) / np.sqrt(8)
+    room = np.clip(clearance - 0.75 - 0.25, 0.0, most)  # half the vehicle's width, and as far from the cones
+    begin = -np.expm1(-((s / SETTLING) ** 2))
     return np.asarray(np.tanh(wave) * room * begin)
 
 

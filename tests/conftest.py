@@ -46,7 +46,7 @@ def _laps_are_solved_once() -> Iterator[None]:
 @pytest.fixture
 def png_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let commands that write several figures write PNG only: most of a PDF's time goes into its fonts."""
-    monkeypatch.setattr("pathspace_graph.eval.figures.style.SUFFIXES", (".png",))
+    monkeypatch.setattr("pathspace_graph.eval.figures.drawing.SUFFIXES", (".png",))
 
 
 @pytest.fixture(autouse=True)

@@ -21,8 +21,7 @@ from pathspace_graph import SettingsError
 from pathspace_graph.batch.joint import solve_together
 from pathspace_graph.cli import main
 from pathspace_graph.estimators import BATCH, ONLINE, make_batch, make_online
-from pathspace_graph.eval.metrics.measures import measure
-from pathspace_graph.eval.metrics.summary import laps_of, summarize
+from pathspace_graph.eval.metrics.measures import laps_of, measure, summarize
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.log_files import read_log, write_log

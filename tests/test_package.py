@@ -12,20 +12,19 @@ import tomllib
 from importlib import import_module
 from pathlib import Path
 
-import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
 
 import pathspace_graph
 from pathspace_graph.cli import COMMANDS, main
-from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import LEFT, RIGHT
 
+from .scenes.drives import ahead, corridor, exact_log
 from .scenes.paths import ROOT
+from .test_docs import blocks
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-README = (ROOT / "README.md").read_text()
 
 
 def python_folders() -> set[Path]:
@@ -175,10 +174,10 @@ def library(name, *rest, **named):
 ctypes.CDLL = library
 import pathspace_graph as package
 [getattr(package, name) for name in package.__all__]
-import pathspace_graph.eval.metrics.accuracy, pathspace_graph.eval.figures.map_plot
+import pathspace_graph.eval.metrics.accuracy, pathspace_graph.eval.figures.drawing
 import pathspace_graph.eval.benchmark
 """
-    assert "pathspace_graph.eval.figures.map_plot" in modules_after(code)
+    assert "pathspace_graph.eval.figures.drawing" in modules_after(code)
 
 
 def test_each_script_is_a_function() -> None:
@@ -188,26 +187,6 @@ def test_each_script_is_a_function() -> None:
 
 
 # --- README ----------------------------------------------------------------------------------------------
-
-
-def blocks(language: str, text: str = README) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
-
-
-def straight_log() -> Log:
-    """A short drive along a straight between two rows of cones."""
-    t = np.arange(0.0, 4.0, 0.02)
-    cones = np.array([[x, y] for x in np.arange(0.0, 60.0, 3.0) for y in (2.0, -2.0)])
-    cycles = []
-    for stamp in np.arange(0.0, 4.0, 0.1):
-        points = cones - [8.0 * stamp, 0.0]
-        points = points[(points[:, 0] > 1.0) & (points[:, 0] < 12.0)]
-        labels = np.where(points[:, 1] > 0, LEFT, RIGHT)
-        cycles.append(
-            Detections(float(stamp), points, np.tile(0.01 * np.eye(2), (len(points), 1, 1)), labels)
-        )
-    twist = np.tile([8.0, 0.0, 0.0], (len(t), 1))
-    return Log(Odometry(t, twist), tuple(cycles), np.array([0.1, 0.1, 0.01]))
 
 
 @pytest.mark.parametrize(
@@ -222,25 +201,20 @@ def test_the_first_example_of_a_page_runs(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    example = blocks("python", (ROOT / page).read_text())[0]
+    example = blocks(ROOT / page, "python")[0]
     assert len(example.strip().splitlines()) <= 12
     (tmp_path / log).parent.mkdir(exist_ok=True)
-    write_log(straight_log(), tmp_path / log)
+    write_log(exact_log(ahead(8.0, 4.0), *corridor(60.0)), tmp_path / log)
     monkeypatch.chdir(tmp_path)
     exec(compile(example, page, "exec"), {})
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == printed
 
 
 def test_the_readme_sets_up_with_one_command_each() -> None:
-    demo, tests = (block.strip() for block in blocks("sh")[:2])
+    demo, tests = (block.strip() for block in blocks(ROOT / "README.md", "sh")[:2])
     assert demo.endswith(".venv/bin/pathspace-graph demo")
     assert tests.endswith(".venv/bin/pytest -n auto --dist loadfile")
     assert all("\n" not in command for command in (demo, tests))
-
-
-def test_what_the_readme_shows_is_there() -> None:
-    for target in re.findall(r"\]\(([^)#:]+)\)", README):
-        assert (ROOT / target).exists(), target
     assert (ROOT / "docs" / "track.png").stat().st_size < 300_000
 
 

@@ -21,8 +21,8 @@ LATE = {
     "commands.pictures": {"eval.view.page"},
     "options.runs": {"io.parsing"},
     "brief": {"eval.figures.notebook"},
-    "io.log": {"eval.figures.map_plot"},
-    "io.map": {"eval.figures.map_plot"},
+    "io.log": {"eval.figures.drawing"},
+    "io.map": {"eval.figures.drawing"},
     "io.results": {"eval.figures.notebook", "frames"},
 }
 """Modules that are imported by name when needed, since matplotlib is slow."""

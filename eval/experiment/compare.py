@@ -12,11 +12,9 @@ import pandas as pd
 
 from pathspace_graph import estimators as registry
 from pathspace_graph.errors import check_name
-from pathspace_graph.eval.figures.map_plot import plot_maps
-from pathspace_graph.eval.figures.style import save_figures
+from pathspace_graph.eval.figures.drawing import plot_maps, save_figures
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
-from pathspace_graph.eval.metrics.measures import METRICS, PAPER
-from pathspace_graph.eval.metrics.summary import has_cones, versions
+from pathspace_graph.eval.metrics.measures import METRICS, PAPER, has_cones, versions
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.map import Map, read_map

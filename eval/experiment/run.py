@@ -1,6 +1,8 @@
 """Studies as they run: cells in parallel, each kept at once, so that a killed one is resumed; one frame."""
 
+import ast
 import os
+import platform
 import shutil
 import sys
 import tempfile
@@ -9,8 +11,12 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache, cached_property, partial
+from hashlib import sha256
+from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec
+from importlib.metadata import packages_distributions, version
+from importlib.util import find_spec
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any, Final
@@ -24,15 +30,15 @@ from threadpoolctl import threadpool_limits
 from pathspace_graph import estimators as registry
 from pathspace_graph.brief import Brief
 from pathspace_graph.errors import InputError, OutputError, SettingsError, SolveError, install
+from pathspace_graph.eval.metrics import measures
 from pathspace_graph.eval.metrics.alignment import aligned_distance
-from pathspace_graph.eval.metrics.measures import METRICS, measure, online_cycles, stage_times
-from pathspace_graph.eval.metrics.summary import has_cones, lap_times, summarize, versions
+from pathspace_graph.eval.metrics.measures import METRICS, versions
 from pathspace_graph.eval.metrics.trajectory import ReachObserver
 from pathspace_graph.io.files import atomic_folder, check_target, to_plain, write_json, write_text
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.parsing import read_json, shown
-from pathspace_graph.io.results import RunResult, write_result
+from pathspace_graph.io.results import RunResult, commit_of, machine, now, write_result
 from pathspace_graph.lengths import times
 from pathspace_graph.loop.worker import end_with
 from pathspace_graph.plausibility.diagnosis import diagnose
@@ -41,8 +47,7 @@ from pathspace_graph.settings.checked import leaves
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.track import Track
 
-from .provenance import Code, check_code, code_from, code_of, here, identity, origin_of
-from .study import Study, StudyDrive, load_tracks, recorded_drive, simulated_drive, track_digest
+from .study import Study, StudyDrive, identity, load_tracks, recorded_drive, simulated_drive, track_digest
 from .tables import RUN, RUN_OF
 
 try:
@@ -52,17 +57,125 @@ except ImportError:  # Windows
 
 CELLS: Final = "cells"  # folder of the kept cells
 STUDY_FILE: Final = "study.json"
-FILES: Final = "files"  # key of the files of a run, on their way from its process
-DIGEST: Final = "digest"  # key of a record's digest in its file
-CELL_FORMAT, STUDY_FORMAT = "pathspace-cell/5", "pathspace-study/1"
+CELL_FORMAT: Final = "pathspace-cell/5"
 CONNECT_SECONDS: Final = 20.0  # time (s) within which a cluster has to answer
 Record = dict[str, Any]  # what is kept of a cell, in the types of JSON only
 OnCell = Callable[[int, int], None]  # called with the numbers of cells that are done, and of all
-RowsOf = Callable[..., list[dict[str, Any]]]
 
 
 class WorkerDiedError(RuntimeError):
     """The process that did the work died."""
+
+
+# --- what a result depends on: sources, libraries, commit and machine ---------------------------------------
+
+HOUSE: Final = __name__.partition(".")[0]
+MEASURED: Final = (  # modules on which every result depends, whatever the estimator is
+    *("run", "sim.simulate", "sim.track_generator", "plausibility.diagnosis"),
+    "eval.metrics.measures",
+)
+Code = dict[str, str]  # digest of each source by its module, and version of each library by its name
+
+
+@cache
+def code_from(module: str) -> Code:
+    """Return the code of a module, of the metrics and of all that they import, as this process has read it.
+
+    Of what is installed, the version stands for the sources, except in the package of the module: an editable
+    package has no version that changes with it. The standard library doesn't count.
+    """
+    if _spec(module) is None:  # a class of a notebook, or of the program itself
+        raise SettingsError(f"estimators: expected one of a module with sources, found {module}")
+    own, found, libraries = {HOUSE, module.partition(".")[0]}, Code(), set[str]()
+    remaining = [(root, HOUSE) for root in (module, *(f"{HOUSE}.{one}" for one in MEASURED))]
+    while remaining:
+        name, importer = remaining.pop()
+        package, spec = name.partition(".")[0], None if name in found else _spec(name)
+        if spec is None or spec.origin is None:
+            continue  # known already, an optional package that is not here, or a folder without sources
+        if package not in own and {"site-packages", "dist-packages"} & set(Path(spec.origin).parts):
+            libraries |= {package} - ({package} if importer == HOUSE else set())
+            continue
+        found[name] = _digest(Path(spec.origin))
+        remaining += [(imported, package) for imported in _imports(name)]
+    known = packages_distributions() if libraries else {}
+    used = {distribution for library in libraries for distribution in known.get(library, [])}
+    versioned = ("gtsam", "numpy", "scipy", *sorted(used))  # the first of which all results depend on
+    return dict(sorted(found.items())) | {name: version(name) for name in versioned}
+
+
+@cache
+def _spec(name: str) -> ModuleSpec | None:
+    """Return where a module is; None where it is none, is not here, or is of the standard library."""
+    if name.partition(".")[0] in sys.stdlib_module_names:
+        return None
+    try:
+        return find_spec(name)
+    except (ImportError, ValueError):  # something else than a module, in a module or in a program
+        return None
+
+
+def _digest(file: Path) -> str:
+    """Return the digest of a source; for a compiled module it is that of its sources, if they are here."""
+    compiled = file.name.endswith(tuple(EXTENSION_SUFFIXES))
+    files = sorted(file.parent.rglob("*.[ch]pp")) if compiled else []
+    return sha256(b"".join(one.read_bytes() for one in files or [file])).hexdigest()[:12]
+
+
+@cache
+def _imports(name: str) -> tuple[str, ...]:
+    """Return the modules that a module imports anywhere in it, and the package that it lies in.
+
+    Our own package runs nothing in its root that a module in it needs.
+    """
+    spec, parents = _spec(name), name.split(".")[:-1]
+    found = [".".join(parents)] if parents and parents[0] != HOUSE else []
+    if spec is None or not str(spec.origin).endswith(".py"):
+        return tuple(found)
+    package = name.split(".") if spec.submodule_search_locations is not None else parents
+    for node in ast.walk(ast.parse(Path(str(spec.origin)).read_bytes())):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else []
+            base = ".".join([*above, *filter(None, [node.module])])
+            of_base = _spec(base)
+            is_package = of_base is not None and of_base.submodule_search_locations is not None
+            inner = [f"{base}.{alias.name}" for alias in node.names] if is_package else []
+            modules = [one for one in inner if _spec(one) is not None]
+            found += [base] * (len(modules) < len(node.names)) + modules  # the one that has the other names
+    return tuple(dict.fromkeys(found))
+
+
+def check_code(module: str, expected: Code, began: str) -> None:
+    """Raise a SettingsError that names both unless this process has the code with which a study began."""
+    found = code_from(module)
+    if found == expected:
+        return
+    name = next(name for name in [*expected, *found] if expected.get(name) != found.get(name))
+    own, other = (code.get(name, "missing") for code in (found, expected))
+    raise SettingsError(
+        f"{module}: expected the code of {began}, where the study began, "
+        f"with {name} {other}, found {name} {own} on {here()}"
+    )
+
+
+def here() -> str:
+    return f"{platform.node()} (process {os.getpid()})"
+
+
+def origin_of(module: str) -> dict[str, Any]:
+    """Return where and when a result of what is in a module is made, and with which libraries."""
+    packages = {HOUSE, module.partition(".")[0]}
+    specs = {name: _spec(name) for name in sorted(packages)}
+    folders = {name: Path(spec.origin).parent for name, spec in specs.items() if spec and spec.origin}
+    commits = {name: commit for name, folder in folders.items() if (commit := commit_of(folder))}
+    return {
+        **versions(),
+        "commit": " ".join(commits.values() if len(packages) == 1 else map(" ".join, commits.items())),
+        **machine(),
+        "date": now(),
+    }
 
 
 # --- cells -------------------------------------------------------------------------------------------------
@@ -80,10 +193,10 @@ class Cell:
     """Identity of everything that the result depends on, except the code."""
     code: Code
     """Code with which the study began."""
-    began: str
-    """Process in which it did."""
     work: Callable[[], Record]
     """Does what the cell does; the record has the `rows` that are returned, and other keys."""
+    began: str = field(default_factory=here)
+    """Process in which the study began."""
     keep: bool = False
     """Whether the files of its run are kept beside its record."""
 
@@ -176,10 +289,10 @@ def read_record(folder: Path, cell: Cell) -> Record | None:
     One without the files of its run is none either, where they are to be kept.
     """
     try:
-        record = read_json(_file(folder, cell), "a cell")
+        record = read_json(folder / CELLS / f"{cell.id}.json", "a cell")
     except InputError:
         return None
-    if not isinstance(record, dict) or record.pop(DIGEST, None) != identity(record=record):
+    if not isinstance(record, dict) or record.pop("digest", None) != identity(record=record):
         return None
     if (record.get("format"), record.get("id")) != (CELL_FORMAT, cell.id):
         return None
@@ -189,12 +302,12 @@ def read_record(folder: Path, cell: Cell) -> Record | None:
 
 def write_record(folder: Path, cell: Cell, record: Record) -> None:
     """Write the record as a file of its own, whole or not at all, after the files of its run."""
-    files = record.pop(FILES, None)
+    files = record.pop("files", None)
     if files is not None:
         with atomic_folder(run_folder(folder, cell), MAP_FILE, force=True) as run:
             for name, text in files.items():
                 write_text(run / name, text)
-    write_json(_file(folder, cell), {**record, DIGEST: identity(record=record)}, indent=1)
+    write_json(folder / CELLS / f"{cell.id}.json", {**record, "digest": identity(record=record)}, indent=1)
 
 
 def of_other_code(folder: Path, cells: Iterable[Cell]) -> int:
@@ -207,10 +320,6 @@ def of_other_code(folder: Path, cells: Iterable[Cell]) -> int:
 def run_folder(folder: Path, cell: Cell) -> Path:
     """Return the folder of the files of a run in that of its study."""
     return folder / CELLS / cell.id
-
-
-def _file(folder: Path, cell: Cell) -> Path:
-    return folder / CELLS / f"{cell.id}.json"
 
 
 @contextmanager
@@ -300,7 +409,7 @@ def estimator_record(
     begin, worked = time.perf_counter(), time.thread_time()
     result = run_estimator(name, settings, log, parameters)
     wall, processor = time.perf_counter() - begin - result.observing, time.thread_time() - worked
-    cycles = online_cycles(result)
+    cycles = measures.online_cycles(result)
     took = wall, sum(record.processor for record in cycles) if cycles else processor
     said = [record.notice for record in result.cycles if record.notice]
     vehicle = result.at_scale_one().vehicle
@@ -308,14 +417,14 @@ def estimator_record(
     record: Record = {
         "notices": "; ".join(dict.fromkeys(said)),
         "lap_count": result.laps,
-        "rows": measure(result, log, took),
-        "stages": stage_times(cycles),
+        "rows": measures.measure(result, log, took),
+        "stages": measures.stage_times(cycles),
     }
     if keep:  # as texts: a worker may have no disk in common with the study
         with tempfile.TemporaryDirectory() as place:
-            write_result(Path(place) / "run", result, summarize(result, log, hints))
+            write_result(Path(place) / "run", result, measures.summarize(result, log, hints))
             files = (Path(place) / "run").iterdir()
-            record[FILES] = {file.name: file.read_text(encoding="utf-8") for file in files}
+            record["files"] = {file.name: file.read_text(encoding="utf-8") for file in files}
     return record
 
 
@@ -324,14 +433,16 @@ def run_estimator(name: str, settings: MapperSettings, log: Log, parameters: Any
     if name not in registry.ONLINE:
         return with_own(registry.make_batch(name, settings, log, parameters).solve(log), parameters)
     estimator, truth = registry.make_online(name, settings, log, parameters), log.at_scale_one().truth
-    observers = [ReachObserver(truth)] if has_cones(truth) and len(truth.poses) else []
-    result = run_online(log, estimator, name=name, snapshot_times=lap_times(log), observers=observers)
+    observers = [ReachObserver(truth)] if measures.has_cones(truth) and len(truth.poses) else []
+    result = run_online(
+        log, estimator, name=name, snapshot_times=measures.lap_times(log), observers=observers
+    )
     result = replace(result, reach=times(observers[0].rows, (1, 2, 0), log.scale)) if observers else result
     return with_own(result, parameters)
 
 
 def rows_of(
-    function: RowsOf,
+    function: Callable[..., list[dict[str, Any]]],
     arguments: Iterable[Mapping[str, Any]],
     folder: Path | None = None,
     *,
@@ -355,7 +466,6 @@ def rows_of(
             names={name: value for name, value in of.items() if isinstance(value, str | int | float)},
             meaning=str(joblib.hash([function.__qualname__, dict(of), depends])),
             code=code,
-            began=here(),
             work=partial(work, of),
         )
         cells.append(cell)
@@ -379,25 +489,6 @@ class Plan(Brief):
     tracks: tuple[Track, ...]
     cells: tuple[EstimatorCell, ...]
 
-    def resolved(self) -> dict[str, Any]:
-        """Return the content of `study.json`: the study with every default written out."""
-        study = self.study
-        same = ("name", "question", "seeds", "laps", "estimators", "varied", "metrics")
-        return {
-            "format": STUDY_FORMAT,
-            **{name: getattr(study, name) for name in same},
-            "tracks": [{"name": track.name, "digest": track_digest(track)} for track in self.tracks],
-            "logs": {track: [folder.name for folder in folders] for track, folders in study.logs.items()},
-            "noise": {name: asdict(study.simulation(name)) for name in study.noise},
-            "variants": {name: asdict(variant.settings) for name, variant in study.points.items()},
-            "parameters": {
-                name: {of: asdict(own) for of, own in variant.parameters}
-                for name, variant in study.points.items()
-                if variant.parameters
-            },
-            "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
-        }
-
 
 def make_plan(study: Study, *, keep: bool = False) -> Plan:
     """Read and generate the tracks, and return the cells, grouped by the log that they share.
@@ -416,18 +507,18 @@ def make_plan(study: Study, *, keep: bool = False) -> Plan:
     for track, folders in study.logs.items():
         limits = study.settings.limits
         drives += [recorded_drive(track, number, folder, limits) for number, folder in enumerate(folders)]
-    code, cells = {name: code_of(name) for name in study.estimators}, list[EstimatorCell]()
+    cells = list[EstimatorCell]()
     for drive, estimator, (name, variant) in product(drives, study.estimators, points.items()):
         settings, parameters = variant.settings, dict(variant.parameters).get(estimator)
         read = {k: v for k, v in leaves(settings).items() if registry.reads(estimator, k)}
         own = None if parameters is None else to_plain(asdict(parameters))
+        module = registry.module_of(estimator)
         cell = EstimatorCell(
-            module=registry.module_of(estimator),
+            module=module,
             names={"track": drive.track, "seed": drive.seed, "noise": drive.noise}
             | {"estimator": estimator, "variant": name},
             meaning=identity(drive=drive.id, estimator=estimator, settings=read, own=own),
-            code=code[estimator],
-            began=here(),
+            code=code_from(module),
             work=partial(estimator_record, drive, estimator, settings, parameters, keep),
             keep=keep,
             drive=drive,
@@ -451,7 +542,18 @@ def run_study(
     plan = study if isinstance(study, Plan) else make_plan(study, keep=keep)
     with tempfile.TemporaryDirectory() if out is None else nullcontext(out) as folder:
         records = run_records(plan, Path(folder), **how)
-        add_agreement(Path(folder), plan.cells, records)
+        # how far each kept map of a recorded log is from those of the other logs of its track (m)
+        maps = dict[tuple[Any, ...], dict[str, Map]]()
+        for cell in plan.cells:
+            run = run_folder(Path(folder), cell)
+            if cell.drive.simulation is None and (run / MAP_FILE).exists():
+                key = (cell.drive.track, cell.estimator, cell.settings, cell.parameters)
+                maps.setdefault(key, {})[cell.id] = read_map(run)
+    for alike in maps.values():
+        for one, other in combinations(alike, 2):
+            apart = aligned_distance(alike[one], alike[other])
+            for whole in (records[one]["rows"][-1], records[other]["rows"][-1]):
+                whole["agreement"] = whole.get("agreement", 0.0) + apart / (len(alike) - 1)
     return frame_of(plan.study, [(cell, records[cell.id]) for cell in plan.cells])
 
 
@@ -470,32 +572,33 @@ def run_records(
     one study at a time, of one name; the study may have changed: cells are used wherever they mean the same.
     """
     check_target(out, STUDY_FILE, force=True)
-    file = out / STUDY_FILE
+    study, file = plan.study, out / STUDY_FILE
     if file.is_file():
         try:
             found = read_json(file, "a study")
         except InputError as error:
             raise OutputError(str(error)) from error
         name = found.get("name") if isinstance(found, dict) else None
-        if name != plan.study.name:
-            raise OutputError(f"{file}: expected the study {plan.study.name}, found {shown(name)}")
+        if name != study.name:
+            raise OutputError(f"{file}: expected the study {study.name}, found {shown(name)}")
+    same = ("name", "question", "seeds", "laps", "estimators", "varied", "metrics")
+    resolved = {  # the study with every default written out
+        "format": "pathspace-study/1",
+        **{name: getattr(study, name) for name in same},
+        "tracks": [{"name": track.name, "digest": track_digest(track)} for track in plan.tracks],
+        "logs": {track: [folder.name for folder in folders] for track, folders in study.logs.items()},
+        "noise": {name: asdict(study.simulation(name)) for name in study.noise},
+        "variants": {name: asdict(variant.settings) for name, variant in study.points.items()},
+        "parameters": {
+            name: {of: asdict(own) for of, own in variant.parameters}
+            for name, variant in study.points.items()
+            if variant.parameters
+        },
+        "baseline": {"variant": study.baseline_variant, "estimator": study.baseline.estimator},
+    }
     with workers(jobs, cluster), locked(out):
-        write_json(file, plan.resolved(), indent=1)
+        write_json(file, resolved, indent=1)
         return run_cells(plan.cells, out, on_cell=on_cell, retry_failed=retry_failed)
-
-
-def add_agreement(out: Path, cells: Sequence[EstimatorCell], records: Mapping[str, Record]) -> None:
-    """Add how far each kept map of a recorded log is from those of the other logs of its track (m)."""
-    maps = dict[tuple[Any, ...], dict[str, Map]]()
-    for cell in cells:
-        if cell.drive.simulation is None and (run_folder(out, cell) / MAP_FILE).exists():
-            key = (cell.drive.track, cell.estimator, cell.settings, cell.parameters)
-            maps.setdefault(key, {})[cell.id] = read_map(run_folder(out, cell))
-    for alike in maps.values():
-        for one, other in combinations(alike, 2):
-            apart = aligned_distance(alike[one], alike[other])
-            for whole in (records[one]["rows"][-1], records[other]["rows"][-1]):
-                whole["agreement"] = whole.get("agreement", 0.0) + apart / (len(alike) - 1)
 
 
 # --- results ---------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Studies: drives, estimators and settings to compare, from a TOML file or in Python."""
 
 import hashlib
+import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -28,8 +29,6 @@ from pathspace_graph.sim.track import EVENTS, Track
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.track_generator import generate_track
 
-from .provenance import identity
-
 SHIPPED: Final = Path(__file__).parents[1] / "studies"
 DEFAULT: Final = "default"  # variant that overrides nothing, part of every study
 PRESET: Final = "preset"  # entry of a noise that names a preset, as in `sensor.preset = "camera"`
@@ -42,6 +41,11 @@ _latest: dict[str, tuple[Log, Sequence[Hint]]] = {}  # the log that was asked fo
 
 
 # --- drives ------------------------------------------------------------------------------------------------
+
+
+def identity(**parts: Any) -> str:
+    """Return a text that is the same for the same values, which are JSON's types only."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:20]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,7 @@ from rich.text import Text
 from scipy import stats
 from tabulate import LATEX_ESCAPE_RULES
 
-from pathspace_graph.eval.figures import style
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREY, WIDTH, save_figures
+from pathspace_graph.eval.figures import drawing
 from pathspace_graph.eval.metrics.measures import METRICS, UNKNOWN, Metric, figure
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.io.files import atomic_file, write_text
@@ -27,7 +26,6 @@ RUN: Final = ("track", "seed")  # columns of a drive; combinations are paired on
 RUN_OF: Final = (*RUN, *COMBINATION)
 TIMES: Final = tuple(key for key, metric in METRICS.items() if metric.time)
 LEVEL: Final = 0.95  # confidence level of intervals; a difference is significant if p < 1 - LEVEL
-ROUND_OFF: Final = 1e-12  # share of differences below which they are all the same
 
 MADE: Final = ("commit", "host", "processor", "blas", "date", "command")  # where and when a run was made
 RATIO: Final = "ratio"  # note of a ratio of two estimators beside a published one
@@ -64,7 +62,7 @@ def paired_p(differences: Array) -> float:
     """
     if len(differences) < 2:
         return float("nan")
-    if np.ptp(differences) <= ROUND_OFF * np.abs(differences).max():
+    if np.ptp(differences) <= 1e-12 * np.abs(differences).max():  # but for round-off all are the same
         return float(differences[0] == 0.0)
     return float(stats.ttest_1samp(differences, 0.0).pvalue)
 
@@ -343,20 +341,21 @@ def beside_published(study: Study, frame: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=header)
 
 
-def plot_published(beside: pd.DataFrame) -> style.Picture:
+def plot_published(beside: pd.DataFrame) -> drawing.Picture:
     """Draw what `beside_published` returns by lap, published values dashed; ratios are left out."""
     panels = beside[beside["compared"] != RATIO].groupby("metric", sort=False)
-    with style.figure_context():
-        figure = style.Picture(figsize=(WIDTH, 2.4), layout="constrained")
+    with drawing.figure_context():
+        figure = drawing.Picture(figsize=(drawing.WIDTH, 2.4), layout="constrained")
         all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
         for axes, (heading, panel) in zip(all_axes, panels, strict=True):
-            for (name, of), color in zip(panel.groupby("estimator", sort=False), style.PALETTE, strict=False):
+            lines = zip(panel.groupby("estimator", sort=False), drawing.PALETTE, strict=False)
+            for (name, of), color in lines:
                 axes.errorbar(of["lap"], of["here"], of["interval"], fmt="o-", color=color, label=name)
                 axes.plot(of["lap"], of["published"], "s--", color=color, label=f"{name}, published")
             laps = sorted({*panel["lap"]})
             axes.set(title=heading, xlabel="lap", xticks=laps, xlim=(laps[0] - 0.5, laps[-1] + 0.5))
             axes.set_ylim(0.0, 1.1 * axes.get_ylim()[1])
-        style.shared_legend(figure)
+        drawing.shared_legend(figure)
     return figure
 
 
@@ -399,7 +398,7 @@ def joined(tables: Sequence[TextTable], caption: str, form: str) -> str:
 # --- figure of studies ----------------------------------------------------------------------------------
 
 
-def plot_differences(study: Study, frame: pd.DataFrame) -> style.Picture:
+def plot_differences(study: Study, frame: pd.DataFrame) -> drawing.Picture:
     """Draw pairs, mean and interval of the difference of each combination from the baseline.
 
     The panels are the first metrics in which any run differs; where none does, there are means in their
@@ -410,18 +409,18 @@ def plot_differences(study: Study, frame: pd.DataFrame) -> style.Picture:
     panels = {key: every[key] for key in (differing or [*every])[:3]}
     compared = np.any([found["differences"].map(len) > 0 for found in panels.values()], axis=0)
     rows = np.flatnonzero(compared | (not differing)).tolist()
-    with style.figure_context():
-        figure = style.Picture(figsize=(WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
+    with drawing.figure_context():
+        figure = drawing.Picture(figsize=(drawing.WIDTH, 1.1 + 0.24 * len(rows)), layout="constrained")
         all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
         for axes, (key, found) in zip(all_axes, panels.items(), strict=True):
             metric, rng = METRICS[key], np.random.default_rng(0)
             if differing:
-                axes.axvline(0.0, color=DARK, linewidth=0.6, zorder=1)
+                axes.axvline(0.0, color=drawing.DARK, linewidth=0.6, zorder=1)
             for row, (_, one) in enumerate(found.iloc[rows].iterrows()):
                 mean, half = one[["difference", "difference_half"] if differing else ["mean", "half"]]
                 if np.isnan(mean):
                     continue
-                color = BLUE if one["significant"] else GREY
+                color = drawing.BLUE if one["significant"] else drawing.GREY
                 pairs = metric.factor * np.array(one["differences"])
                 scattered = row + rng.uniform(-0.22, 0.22, len(pairs))  # so that they can be seen apart
                 axes.plot(pairs, scattered, ".", color=color, alpha=0.5, markersize=3.5, zorder=2)
@@ -454,7 +453,7 @@ def write_study(study: Study, frame: pd.DataFrame, out: Path) -> str:
     for form in ("txt", "md", "tex"):
         write_text(out / f"summary.{form}", joined(tables, note, form))
     results_table(study, frame).write(out, "table", "tex")
-    save_figures(out / "figures", figures)
+    drawing.save_figures(out / "figures", figures)
     return joined(tables, note, "txt")
 
 

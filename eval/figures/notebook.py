@@ -9,8 +9,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from pathspace_graph.eval.metrics.measures import METRICS, measure
-from pathspace_graph.eval.metrics.summary import health_of, summarize
+from pathspace_graph.eval.metrics.measures import METRICS, health_of, measure, summarize
 from pathspace_graph.health import CONDITIONS, Health, stretches
 from pathspace_graph.io.log import Log, Odometry, Truth
 from pathspace_graph.io.map import Map
@@ -18,7 +17,7 @@ from pathspace_graph.io.results import RunResult
 from pathspace_graph.plausibility.judge import Hint
 from pathspace_graph.settings.checked import Checked, leaves
 
-from .map_plot import HEALTH_COLORS, TRAJECTORY_COLOR
+from .drawing import GREEN, HEALTH_COLORS
 
 UNITS: Final = {  # of the calibrations of a summary
     **{"scale": "-", "bias": "rad/s", "yaw": "rad", "lateral": "m", "latency": "s"},
@@ -91,7 +90,7 @@ def health_bar(t: Sequence[float], healths: Sequence[Health]) -> str:
     if not len(t) or not any(one.condition for one in healths):
         return ""
     begin, whole = t[0], max(t[-1] - t[0], 1e-9)
-    bar = "position:relative;height:14px;max-width:700px;background:" + TRAJECTORY_COLOR
+    bar = "position:relative;height:14px;max-width:700px;background:" + GREEN
     parts = []
     for one in stretches(t, healths):
         left, width = 100.0 * (one.begin - begin) / whole, 100.0 * (one.end - one.begin) / whole

@@ -11,24 +11,16 @@ from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
 from pathspace_graph.errors import SettingsError
+from pathspace_graph.factors import se2
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise, huber_weights
-from pathspace_graph.factors.se2 import (
-    compose,
-    difference,
-    inverse,
-    left_of,
-    move_points,
-    rotated,
-    wrap_angle,
-)
+from pathspace_graph.factors.se2 import left_of, move_points, wrap_angle
 from pathspace_graph.front_end.measurement import SeenCycle, Sightings
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, MapBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
 
-from .accuracy import boundary_distances, cones_of, mapped_points, mean_of, root_mean_square
-from .consistency import near_pairs
+from .accuracy import boundary_distances, cones_of, mapped_points, mean_of, near_pairs, root_mean_square
 
 STEP: Final = 0.5  # distance of the points of a curve that are compared (m)
 
@@ -43,11 +35,6 @@ class MapsApart:
     """Points (k, 2) of each boundary in the frame of the second map, those of the first map first."""
     distances: dict[int, Array]
     """Their distances (k,) from the boundary of the other map (m)."""
-
-    @property
-    def mean(self) -> float:
-        """Return the mean two-way distance (m); infinite where the maps share no boundary."""
-        return self.statistics()["both"]["mean"] if self.distances else np.inf
 
     def statistics(self) -> dict[str, dict[str, float]]:
         """Return mean, rms, 95th percentile and largest distance (m), of both boundaries and of each."""
@@ -75,10 +62,21 @@ def maps_apart(track: Map, reference: Map) -> MapsApart:
         raise SettingsError("maps: expected a boundary that both have, found none")
     first, second = ([of.boundaries[label] for label in shared] for of in (track, reference))
     points, others = ([mapped_points(boundary, STEP) for boundary in of] for of in (first, second))
+    # about the same start, and about the same middle in the three best of all directions
+    starts = [np.array([ahead, 0.0, 0.0]) for ahead in (0.0, -4.0, -2.0, 2.0, 4.0)]
+    middle, target = (np.concatenate(of).mean(axis=0) for of in (points, others))
+    trees, turned = [KDTree(own) for own in others], list[tuple[float, Array]]()
+    for turn in np.arange(0.0, 2.0 * np.pi, np.deg2rad(2.0)).tolist():
+        shift = target - move_points(np.array([0.0, 0.0, turn]), middle[None])[0]
+        motion = np.append(shift, turn)
+        pairs = zip(trees, points, strict=True)
+        away = [tree.query(move_points(motion, own[::2]))[0] for tree, own in pairs]
+        turned.append((mean_of(np.concatenate(away)), motion))
+    turned.sort(key=lambda one: one[0])
     tries = []
-    for start in _starts(points, others):
+    for start in starts + [motion for _, motion in turned[:3]]:
         motion = aligning(points, second, start)
-        back, both, distances = inverse(motion), dict[int, Array](), dict[int, Array]()
+        back, both, distances = se2.inverse(motion), dict[int, Array](), dict[int, Array]()
         for k, label in enumerate(shared):
             moved, returned = move_points(motion, points[k]), move_points(back, others[k])
             both[label] = np.concatenate([moved, others[k]])
@@ -86,13 +84,13 @@ def maps_apart(track: Map, reference: Map) -> MapsApart:
             distances[label] = np.concatenate(ways)
         motion = np.append(motion[:2], wrap_angle(motion[2:]))
         tries.append(MapsApart(motion, both, distances))
-    return min(tries, key=lambda one: one.mean)
+    return min(tries, key=lambda one: one.statistics()["both"]["mean"])
 
 
 def aligned_distance(track: Map, reference: Map) -> float:
     """Return the mean two-way distance (m) of two maps; it is infinite where they share no boundary."""
     shared = set(track.boundaries) & set(reference.boundaries)
-    return maps_apart(track, reference).mean if shared else np.inf
+    return maps_apart(track, reference).statistics()["both"]["mean"] if shared else np.inf
 
 
 def shape_rmse(track: Map, truth: Truth) -> float:
@@ -106,21 +104,6 @@ def shape_rmse(track: Map, truth: Truth) -> float:
     pairs = zip(boundaries, cones, strict=True)
     distances = [boundary_distances(boundary, move_points(motion, own)) for boundary, own in pairs]
     return root_mean_square(np.concatenate([np.zeros(0), *distances]))
-
-
-def _starts(points: Sequence[Array], others: Sequence[Array]) -> list[Array]:
-    """Return motions (3,) to begin with: about the same start, and about the same middle in any direction."""
-    starts = [np.array([ahead, 0.0, 0.0]) for ahead in (0.0, -4.0, -2.0, 2.0, 4.0)]
-    middle, target = (np.concatenate(of).mean(axis=0) for of in (points, others))
-    trees, turned = [KDTree(own) for own in others], list[tuple[float, Array]]()
-    for turn in np.arange(0.0, 2.0 * np.pi, np.deg2rad(2.0)).tolist():
-        shift = target - move_points(np.array([0.0, 0.0, turn]), middle[None])[0]
-        motion = np.append(shift, turn)
-        pairs = zip(trees, points, strict=True)
-        away = [tree.query(move_points(motion, own[::2]))[0] for tree, own in pairs]
-        turned.append((mean_of(np.concatenate(away)), motion))
-    turned.sort(key=lambda one: one[0])
-    return starts + [motion for _, motion in turned[:3]]
 
 
 def aligning(points: Sequence[Array], boundaries: Sequence[MapBoundary], start: Array) -> Array:
@@ -203,8 +186,8 @@ def end_by_registration(cycles: Sequence[SeenCycle], noise: MeasuredNoise | None
     tries, reckoned = list[tuple[float, float, Array]](), cycles[-1].pose
     drifted = (2.0, 2.0, 0.1)  # standard deviations of dead reckoning at the end of a lap (m, m, rad)
     for offset in product((-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-0.1, 0.0, 0.1)):
-        score, pose = _registered(start, end, compose(reckoned, np.array(offset)))
-        drift = float(np.square(difference(pose, reckoned) / drifted).sum())
+        score, pose = _registered(start, end, se2.compose(reckoned, np.array(offset)))
+        drift = float(np.square(se2.difference(pose, reckoned) / drifted).sum())
         tries.append((score - drift, score, pose))
     _, score, pose = max(tries, key=lambda one: one[0])
     return np.append(pose[:2], wrap_angle(pose[2:])) if score > 0.0 else None
@@ -260,7 +243,9 @@ def _registered(
             distance, nearest = map(np.asarray, KDTree(known).query(points))
             rows = np.flatnonzero(distance < gate)
             off = points[rows] - known[nearest[rows]]
-            W = np.linalg.inv(known_covariance[nearest[rows]] + rotated(seen_covariance[rows], pose[None, 2]))
+            W = np.linalg.inv(
+                known_covariance[nearest[rows]] + se2.rotated(seen_covariance[rows], pose[None, 2])
+            )
             square = np.einsum("ki,kij,kj->k", off, W, off)
             W *= huber_weights(np.sqrt(square), 1.5)[:, None, None]
             J = np.concatenate(

@@ -1,28 +1,34 @@
-"""What is measured of a run: one function measures all metrics, lap by lap and of the whole."""
+"""What is measured of a run: all metrics, lap by lap and of the whole; and what its `summary.json` says."""
 
+import platform
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
 from itertools import repeat
 from math import isfinite, nan
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeGuard
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
+from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.se2 import difference, path_lengths
+from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.front_end.front_end import seen_cycles
-from pathspace_graph.health import DEGRADED, LOST
+from pathspace_graph.health import DEGRADED, LOST, Health, HealthStretch, counts, stretches
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, SplineBoundary
-from pathspace_graph.io.results import BatchRun, CycleRecord, RunResult
-from pathspace_graph.plausibility.diagnosis import by_prior
+from pathspace_graph.io.results import BatchRun, CycleRecord, RunNoise, RunResult
+from pathspace_graph.labels import BOUNDARIES, NAMES
+from pathspace_graph.lengths import scaled
+from pathspace_graph.plausibility.diagnosis import by_prior, crossings_of, diagnose, noise_lines
+from pathspace_graph.plausibility.judge import Hint
 
 from . import accuracy, trajectory
-from .accuracy import root_mean_square, true_lap_ends
+from .accuracy import LapMetrics
 from .alignment import end_by_registration
-from .consistency import aligned, consistency_at_cones, map_nees, similarity_from_truth, with_marginals
-from .summary import has_cones, lap_times
 
 FACTORS: Final[Mapping[str, float]] = {"%": 100.0, "kB": 1e-3, "°": float(np.rad2deg(1.0)), "mrad/s": 1e3}
 """Factors from the shares, bytes and radians of the columns to the units of the tables."""
@@ -57,7 +63,7 @@ class Metric:
         known = known[~np.isnan(known)]
         if len(known) == 0:
             return float("nan")
-        return root_mean_square(known) if self.average == "rms" else float(np.mean(known))
+        return accuracy.root_mean_square(known) if self.average == "rms" else float(np.mean(known))
 
     def text(self, value: float, half: float = nan, sign: str = "") -> str:
         """Return a value in the unit of the tables, with half the width of its interval."""
@@ -254,21 +260,22 @@ def _map_values(track: Map, truth: Truth | None) -> dict[str, float]:
     values |= accuracy.cone_errors(track, truth) | accuracy.boundary_errors(track, truth)
     if any(own.size and not own.covariance.size for own in track.boundaries.values()):
         return values  # an outline
-    values |= {"nees": map_nees(track, truth)} | consistency_at_cones(track, truth)
+    values |= {"nees": accuracy.map_nees(track, truth)} | accuracy.consistency_at_cones(track, truth)
     for name, (error, sigma) in accuracy.centre_line_errors(track, truth).items():
         known = ~np.isnan(error)
         if known.any():
             values[name] = accuracy.root_mean_square(error[known])
             if (sigma[known] > 0.0).all():
                 values[f"{name}_nees"] = float(np.mean((error[known] / sigma[known]) ** 2))
-    (turn,), (turned, scale) = similarity_from_truth(track, truth, 1), similarity_from_truth(track, truth)
+    (turn,) = accuracy.similarity_from_truth(track, truth, 1)
+    turned, scale = accuracy.similarity_from_truth(track, truth)
     whole = {"turn": turn.value, "turn_nees": turn.nees}
     whole |= {"map_scale": scale.value, "map_scale_nees": scale.nees}
     if not np.isnan(scale.value):
-        found = accuracy.cone_errors(track, aligned(truth, turned.value, scale.value))
+        found = accuracy.cone_errors(track, accuracy.aligned(truth, turned.value, scale.value))
         whole["rmse_aligned"] = found["rmse"] / np.exp(scale.value)
     values |= {key: value for key, value in whole.items() if not np.isnan(value)}
-    found = consistency_at_cones(with_marginals(track), truth)
+    found = accuracy.consistency_at_cones(accuracy.with_marginals(track), truth)
     return values | {f"{key}_marginals": value for key, value in found.items()}
 
 
@@ -307,7 +314,7 @@ def closes_falsely(run: RunResult, truth: Truth) -> bool:
     """
     if not run.map.closed:
         return False
-    t, ends = closing_stamp(run), true_lap_ends(truth)
+    t, ends = closing_stamp(run), accuracy.true_lap_ends(truth)
     if len(ends) == 0:
         return True
     driven = path_lengths(truth.poses)
@@ -342,3 +349,167 @@ def online_cycles(run: RunResult, begin: float = -np.inf, end: float = np.inf) -
     if isinstance(run, BatchRun):
         return []
     return [record for record in run.cycles if begin < record.t <= end]
+
+
+# --- the summary of a run (docs/formats.md) --------------------------------------------------------------
+
+
+def summarize(result: RunResult, log: Log | None, hints: Sequence[Hint] = ()) -> dict[str, Any]:
+    """Return the estimator, settings, versions, laps, timing, hints, and with truth the paper's metrics.
+
+    Without the log, what only it can say is left out.
+    """
+    factor = 1.0 / result.scale
+    summary: dict[str, Any] = {
+        "estimator": result.estimator,
+        "settings": result.settings,
+        "scale": result.scale,
+        "sensor_kind": result.settings.get("kind") or (log and log.sensor.kind) or "cones",
+        "versions": versions(),
+        "lap_count": result.laps,
+        "closed": result.map.closed,
+        "size": result.map.size,
+        "not_mapped": not_mapped(result.map, log) if log is not None else [],
+        "points": {NAMES[label]: own.size for label, own in sorted(result.map.points.items())},
+        "gate": {
+            "dropped": sum(record.dropped for record in result.cycles),
+            "refused": sum(record.refused for record in result.cycles),
+        },
+        **_cycles(result),
+    }
+    if crossed := crossings_of(result):
+        places = [(NAMES[one.label], *one.place.tolist(), one.driven) for one in crossed]
+        keys = ("boundary", "x", "y", "driven")
+        summary["crossings"] = [dict(zip(keys, place, strict=True)) for place in places]
+    if hints:
+        summary["hints"] = [vars(hint) for hint in hints]
+    if result.noise is not None:
+        summary["noise"] = _noise(result.noise, log)
+        notes = noise_lines(scaled(result.noise, factor))
+        summary |= {"notes": notes} if notes else {}
+    if result.vehicle is not None:
+        named, found = result.vehicle.by_name, diagnose(scaled(result.vehicle, factor), result.settings)
+        values = {name: value for name, (value, _) in named.items()}
+        values |= {f"{name}_sigma": sigma for name, (_, sigma) in named.items()}
+        summary |= {"calibration": values, "heading_sigma": float(result.vehicle.sigmas[2])}
+        summary |= {"diagnosis": found} if found else {}
+    if log is not None and log.truth is not None:
+        if has_cones(log.truth):
+            summary["laps"] = [asdict(row) for row in laps_of(result, log)]
+            summary["final"] = asdict(_metrics(result.map, log.truth, result.laps, result.scale))
+            del summary["final"]["lap"]
+            of_one = scaled(log.truth, factor)
+            at_cones = accuracy.consistency_at_cones(result.at_scale_one().map, of_one)
+            summary["inside_two_sigma"] = at_cones["inside"]
+        if len(log.truth.poses) and len(result.trajectory):
+            errors = trajectory.trajectory_errors(result.trajectory_t, result.trajectory, log.truth)
+            summary["ate"] = trajectory.position_rms(errors)
+            names = ("rmse_along", "rmse_across", "rmse_heading")  # m, m, rad
+            summary |= dict(zip(names, map(accuracy.root_mean_square, errors.T), strict=True))
+    return summary
+
+
+def _cycles(result: RunResult) -> dict[str, Any]:
+    """Times of the updates, batches, notices and health of a run."""
+    seconds = [record.seconds for record in result.cycles]
+    found: dict[str, Any] = {"seconds": None}
+    if seconds:
+        p99 = float(np.quantile(seconds, 0.99))
+        found["seconds"] = {"mean": float(np.mean(seconds)), "p99": p99, "max": max(seconds)}
+    if result.batches is not None:
+        found["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
+    told = [record for record in result.cycles if record.jump is not None or record.notice]
+    if told:
+        keys = ("cycle", "t", "jump", "notice")
+        found["events"] = [{key: getattr(record, key) for key in keys} for record in told]
+    if any(record.health for record in result.cycles):
+        number = counts([health_of(record) for record in result.cycles])
+        found["health"] = {**number, "stretches": [asdict(of) for of in stretches_of(result)]}
+    return found
+
+
+def _noise(noise: RunNoise, log: Log | None) -> dict[str, Any]:
+    stated: dict[str, Any] = {}
+    if log is not None and log.odometry_stated:
+        stated["odometry"] = log.odometry_sigma.tolist()
+    cycles = log.cycles if log is not None and log.detections_stated else ()
+    points = np.concatenate([np.zeros((0, 2)), *(cycle.points_vehicle for cycle in cycles)])
+    if len(points):
+        covariances = np.concatenate([cycle.covariances for cycle in cycles])
+        along, across = np.median(ray_sigmas(points, covariances), axis=0).tolist()
+        distance = float(np.median(np.hypot(*points.T)))
+        stated["detections"] = {"range": distance, "along": along, "across": across}
+    sources = {"odometry": noise.odometry, "detections": noise.detections, "stated": stated}
+    measured = noise.measured
+    if measured is None:
+        return sources
+    values: dict[str, Any] = {"odometry": measured.odometry.tolist(), "drift": measured.drift.tolist()}
+    values["seconds"] = measured.seconds
+    for name, ray in (("along", measured.along), ("across", measured.across)):
+        if ray is not None:
+            begin, growth = ray.sigma.tolist()
+            values[name] = {"sigma": begin, "growth": growth, "share": ray.share, "time": ray.time}
+    if measured.along is not None:
+        sigmas = (f"{name}_sigma" for name in SENSOR)
+        values |= dict(zip(SENSOR, measured.sensor.tolist(), strict=True))
+        values |= dict(zip(sigmas, measured.sensor_sigma.tolist(), strict=True))
+        values["range_bend"] = measured.range_bend
+    return sources | {"measured": values}
+
+
+def stretches_of(result: RunResult) -> list[HealthStretch]:
+    return stretches([r.t for r in result.cycles], [health_of(r) for r in result.cycles])
+
+
+def health_of(record: CycleRecord) -> Health:
+    return Health(record.health, record.reason)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and the libraries that a result depends on."""
+    libraries = {name: version(name) for name in ("pathspace-graph", "gtsam", "numpy", "scipy")}
+    return {"python": platform.python_version(), **libraries}
+
+
+def lap_times(log: Log) -> Array:
+    """Return the stamps (s) at which true laps end; without a true path there are none."""
+    if log.truth is None or len(log.truth.poses) == 0:
+        return np.zeros(0)
+    return log.truth.pose_t[accuracy.true_lap_ends(scaled(log.truth, 1.0 / log.scale))]
+
+
+def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
+    """Return the paper's table: a row at the end of each true lap, or that of the end where there is none.
+
+    Without a true path the laps are the estimated ones; without true cones there is no row. The snapshots of
+    `result` are those at `lap_times`. A batch has one row.
+    """
+    if not has_cones(log.truth):
+        return []
+    if isinstance(result, BatchRun):
+        return [_metrics(result.map, log.truth, result.laps, result.scale)]
+    by_truth = tuple(enumerate(result.snapshots, start=1))
+    maps = by_truth if len(log.truth.poses) else result.lap_maps
+    return [_metrics(track, log.truth, lap, result.scale) for lap, track in maps or ((0, result.map),)]
+
+
+def _metrics(track: Map, truth: Truth, lap: int, scale: float) -> LapMetrics:
+    found = accuracy.lap_metrics(scaled(track, 1.0 / scale), scaled(truth, 1.0 / scale), lap)
+    return replace(found, rmse=found.rmse * scale)
+
+
+def not_mapped(track: Map, log: Log) -> list[str]:
+    """Return a line for each boundary that the map lacks, with the reason."""
+    labels = np.concatenate([np.zeros(0, dtype=int), *(cycle.labels for cycle in log.cycles)])
+    lines = []
+    for label in BOUNDARIES:
+        if label not in track.boundaries:
+            name, count = NAMES[label], int(np.sum(labels == label))
+            reason = f"{count} {name} detections were too few or agreed too little"
+            lines.append(f"{name} boundary: not mapped, " + (reason if count else f"no {name} detections"))
+    return lines
+
+
+def has_cones(truth: Truth | None) -> TypeGuard[Truth]:
+    """Return whether there is a truth that holds cones of a boundary."""
+    return truth is not None and bool(np.isin(truth.cone_labels, BOUNDARIES).any())

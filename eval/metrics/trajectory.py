@@ -6,10 +6,10 @@ from typing import Final
 import numpy as np
 from scipy.spatial import KDTree
 
-from pathspace_graph.factors.arrays import Array, IntArray
+from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle, wrap_angle
 from pathspace_graph.io.log import Truth
-from pathspace_graph.io.map import Map, MapBoundary, SplineBoundary
+from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.run import ObservedCycle
@@ -101,14 +101,26 @@ class ReachObserver:
         path, heading = truth.poses[:, :2], np.unwrap(truth.poses[:, 2])
         driven, own = arc_lengths(path), np.isin(truth.cone_labels, BOUNDARIES)
         ends = driven[true_lap_ends(truth)]
-        stations, cone = _passes(path, driven, truth.cones[own], ends)
+        # the stations (m) at which the cones are passed, and the cone of each
+        if len(ends):
+            begins, laps = np.append(0.0, ends), []
+            for begin, end in pairwise(begins):
+                lap = np.flatnonzero((driven >= begin) & (driven <= end))
+                nearest = np.asarray(KDTree(path[lap]).query(truth.cones[own])[1], np.intp)
+                laps.append(driven[lap[nearest]])
+            laps.append(laps[-1] + begins[-1] - begins[-2])
+            stations, cone = np.concatenate(laps), np.tile(np.arange(np.count_nonzero(own)), len(laps))
+        else:
+            nearest = np.asarray(KDTree(path).query(truth.cones[own])[1], np.intp)
+            cone = np.flatnonzero((nearest > 0) & (nearest < len(path) - 1))
+            stations = driven[nearest[cone]]
         order = np.argsort(stations, kind="stable")
         self._t, self._drive = truth.pose_t, np.column_stack([driven, path, heading])
         self._stations = stations[order]
         self._cones, self._labels = truth.cones[own][cone[order]], truth.cone_labels[own][cone[order]]
-        lap, whole = (ends[0], np.inf) if len(ends) else (driven[-1], driven[-1] - MOST)
+        first, whole = (ends[0], np.inf) if len(ends) else (driven[-1], driven[-1] - MOST)
         # stations between which cycles count (m): on the first 3 % of lap 1 the map has only begun
-        self._counted = float(0.03 * lap), float(whole)
+        self._counted = float(0.03 * first), float(whole)
         self._rows: list[tuple[float, float, int]] = []
 
     def __call__(self, cycle: ObservedCycle) -> None:
@@ -143,32 +155,15 @@ class ReachObserver:
         points = to_map(to_vehicle(cones, np.broadcast_to(pose_true, each)), np.broadcast_to(pose, each))
         distances = np.full(len(points), np.inf)
         for label, boundary in track.boundaries.items():
-            distances[labels == label] = _distances(boundary, points[labels == label])
+            own = points[labels == label]
+            if isinstance(boundary, SplineBoundary):  # on a coarser grid
+                feet = boundary.spline.foot_points(own)
+                distances[labels == label] = np.linalg.norm(own - feet.position, axis=1)
+            else:
+                distances[labels == label] = boundary_distances(boundary, own)
         reach = float(away[distances > 0.5].min(initial=MOST))
         on_stretch = distances[away < reach]
         return reach, float(on_stretch @ on_stretch), len(on_stretch)
-
-
-def _passes(path: Array, driven: Array, cones: Array, ends: Array) -> tuple[Array, IntArray]:
-    """Return the stations (P,) in m at which a path (N, 2) passes cones (n, 2), and each one's cone (P,)."""
-    if len(ends) == 0:
-        nearest = np.asarray(KDTree(path).query(cones)[1], np.intp)
-        beside = np.flatnonzero((nearest > 0) & (nearest < len(path) - 1))
-        return driven[nearest[beside]], beside
-    begins = np.append(0.0, ends)
-    laps = []
-    for begin, end in pairwise(begins):
-        lap = np.flatnonzero((driven >= begin) & (driven <= end))
-        laps.append(driven[lap[np.asarray(KDTree(path[lap]).query(cones)[1], np.intp)]])
-    laps.append(laps[-1] + begins[-1] - begins[-2])
-    return np.concatenate(laps), np.tile(np.arange(len(cones)), len(laps))
-
-
-def _distances(boundary: MapBoundary, points: Array) -> Array:
-    """Return the distance (k,) in m of each point (k, 2) from a mapped boundary, on a coarser grid."""
-    if isinstance(boundary, SplineBoundary):
-        return np.asarray(np.linalg.norm(points - boundary.spline.foot_points(points).position, axis=1))
-    return boundary_distances(boundary, points)
 
 
 def reach_values(rows: Array) -> dict[str, float]:

@@ -15,10 +15,9 @@ from bokeh.resources import INLINE
 from bokeh.themes import Theme
 from jinja2 import Template
 
-from pathspace_graph.eval.figures import style
-from pathspace_graph.eval.figures.map_plot import BOUNDARY_COLORS, HEALTH_COLORS, TRAJECTORY_COLOR
+from pathspace_graph.eval.figures import drawing
+from pathspace_graph.eval.figures.drawing import BLUE, DARK, GREEN, GREY, LIGHT, ORANGE, PURPLE, RED
 from pathspace_graph.eval.figures.notebook import notice, sections, table
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, LIGHT, ORANGE, PURPLE, RED
 from pathspace_graph.eval.metrics.accuracy import mapped_points
 from pathspace_graph.eval.metrics.alignment import STEP, MapsApart
 from pathspace_graph.factors.arrays import Array
@@ -28,13 +27,11 @@ from pathspace_graph.labels import NAMES
 
 from .recording import OUTLINE
 
-OPTIONAL: Final = {"offered": 0, "health": "", "reason": ""}  # columns of the cycles that may be missing
 TRAIL: Final = 10.0  # time for which the path behind the vehicle is thick (s)
 OVER: Final[dict[str, Any]] = {  # of a figure over the time or along a boundary
     **{"height": 165, "sizing_mode": "stretch_width"},
     **{"min_border_left": 55, "toolbar_location": None},  # the axes below each other
 }
-LEGEND: Final = {"padding": 2, "margin": 0, "label_text_font_size": "9pt", "click_policy": "hide"}
 
 PAGE: Final = Template("""{% extends base %}
 {% block postamble %}
@@ -105,7 +102,8 @@ def page(
     `other` is the name of another map, the map, and how it lies on this one (`maps_apart(other, track)`).
     """
     begin = float(cycles["t"].iloc[0])
-    missing = {name: value for name, value in OPTIONAL.items() if name not in cycles}
+    optional = {"offered": 0, "health": "", "reason": ""}
+    missing = {name: value for name, value in optional.items() if name not in cycles}
     cycles = cycles.assign(since=cycles["t"] - begin, ms=1e3 * cycles["seconds"], **missing)
     source = ColumnDataSource({name: cycles[name].to_numpy() for name in cycles}, name="cycles")
     vehicle, driven = (ColumnDataSource({"x": [], "y": []}, name=name) for name in ("vehicle", "driven"))
@@ -113,7 +111,7 @@ def page(
     slider = Slider(name="slider", title="cycle", start=0, end=last, value=last, sizing_mode="stretch_width")
 
     drawn = _map_figure(track, source, summary, passed, other)
-    look = {"color": TRAJECTORY_COLOR, "line_width": 4, "legend_label": f"last {TRAIL:g} s"}
+    look = {"color": GREEN, "line_width": 4, "legend_label": f"last {TRAIL:g} s"}
     drawn.line("x", "y", source=driven, **look)
     drawn.patch("x", "y", source=vehicle, color="black", line_width=4)
     drawn.legend.update(ncols=3, label_width=88, location="center")
@@ -135,7 +133,8 @@ def page(
     fixed = {"cycles": source, "ahead": ahead, "left": left, "trail": TRAIL}
     move = CustomJS(args=moved | fixed, code=MOVE)
     slider.js_on_change("value", move)
-    document = Document(theme=Theme(json={"attrs": {"Legend": LEGEND}}))
+    legend = {"padding": 2, "margin": 0, "label_text_font_size": "9pt", "click_policy": "hide"}
+    document = Document(theme=Theme(json={"attrs": {"Legend": legend}}))
     document.js_on_event(DocumentReady, move)
     for root in (slider, readout, drawn, *over):
         document.add_root(root)
@@ -157,7 +156,7 @@ def _map_figure(
     drawn = figure(name="map", match_aspect=True, **shape, **tools, **axes)
     drawn.toolbar.update(logo=None)
     for label, boundary in sorted(track.boundaries.items()):
-        _draw_boundary(drawn, boundary, NAMES[label], BOUNDARY_COLORS[label])
+        _draw_boundary(drawn, boundary, NAMES[label], drawing.BOUNDARY_COLORS[label])
     for label, cones in sorted(track.points.items()):
         name = f"{NAMES[label].replace('_', ' ')} cones"
         drawn.scatter(*cones.points.T, marker="triangle", size=8, color=RED, legend_label=name, name=name)
@@ -174,8 +173,8 @@ def _map_figure(
         drawn.scatter(**places, marker="x", size=10, color=PURPLE, legend_label="not as the known map")
     if passed is not None:
         drawn.line(*passed[:, :2].T, color=LIGHT, legend_label="as estimated then", name="passed")
-    path = drawn.line("x", "y", source=source, color=TRAJECTORY_COLOR, legend_label="path", name="path")
-    for condition, color in HEALTH_COLORS.items():
+    path = drawn.line("x", "y", source=source, color=GREEN, legend_label="path", name="path")
+    for condition, color in drawing.HEALTH_COLORS.items():
         chosen = source.data["health"] == condition
         if chosen.any():
             x, y = (np.where(chosen, source.data[axis], np.nan) for axis in "xy")
@@ -189,13 +188,13 @@ def _draw_boundary(drawn: figure, boundary: MapBoundary, name: str, color: str) 
     """Draw a curve with its 2-sigma band, control points and cones, or landmarks with their ellipses."""
     band = {"color": color, "alpha": 0.3, "line_width": 0, "name": f"{name} band"}
     if isinstance(boundary, PointBoundary):
-        ellipses = style.ellipse_outlines(boundary.points, boundary.covariance)
+        ellipses = drawing.ellipse_outlines(boundary.points, boundary.covariance)
         drawn.patches(*(list(ellipses[:, :, axis]) for axis in (0, 1)), legend_label=f"{name}, 2σ", **band)
         drawn.scatter(*boundary.points.T, size=4, color=color, legend_label=f"{name} landmarks", name=name)
         return
     spline, until = boundary.spline, boundary.confirmed_until
-    u = style.curve_parameters(spline)
-    left, right = style.uncertainty_band(boundary, u)
+    u = drawing.curve_parameters(spline)
+    left, right = drawing.uncertainty_band(boundary, u)
     drawn.patch(*np.concatenate([left, right[::-1]]).T, legend_label=f"{name}, 2σ band", **band)
     look = {"color": color, "line_width": 1.5}
     known = spline.evaluate(u[u <= until])
@@ -219,7 +218,7 @@ def _time_figures(source: ColumnDataSource, summary: Mapping[str, Any], begin: f
     since, healths = data["since"], [*map(Health, data["health"], data["reason"])]
     watched = any(one.condition for one in healths)
     spans = [(GOOD if watched else "not monitored", 0.0, since[-1], "", GREEN if watched else LIGHT)]
-    spans += [(*vars(one).values(), HEALTH_COLORS[one.health]) for one in stretches(since, healths)]
+    spans += [(*vars(one).values(), drawing.HEALTH_COLORS[one.health]) for one in stretches(since, healths)]
     names = ("health", "begin", "end", "reason", "color")
     bars = dict(zip(names, zip(*spans, strict=True), strict=True))
     look = {"fill_color": "color", "line_color": "color", "name": "health"}
@@ -252,7 +251,7 @@ def _distances(name: str, track: Map, known: Map, apart: MapsApart) -> figure:
     drawn = figure(name="over distance", title=title, x_axis_label=along, tools="", **OVER)
     for label in sorted(set(track.splines) & set(apart.distances)):
         own = apart.distances[label][len(mapped_points(known.boundaries[label], STEP)) :]
-        look = {"color": BOUNDARY_COLORS[label], "legend_label": NAMES[label]}
+        look = {"color": drawing.BOUNDARY_COLORS[label], "legend_label": NAMES[label]}
         drawn.line(STEP * np.arange(len(own)), own, name=f"distance {NAMES[label]}", **look)
     _legend_above(drawn)
     return drawn

@@ -5,30 +5,29 @@ import socket
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
 
+from pathspace_graph import labels
 from pathspace_graph.errors import SettingsError, install
-from pathspace_graph.eval.figures import style
-from pathspace_graph.eval.figures.map_plot import BOUNDARY_COLORS, HEALTH_COLORS, TRAJECTORY_COLOR
-from pathspace_graph.eval.figures.style import BLUE, DARK, GREEN, GREY, LIGHT, ORANGE, RED
+from pathspace_graph.eval.figures import drawing
+from pathspace_graph.eval.figures.drawing import BLUE, DARK, GREEN, GREY, LIGHT, ORANGE, RED
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import CONDITIONS, LOST, Health
 from pathspace_graph.io.files import atomic_file, check_file_target
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, PointBoundary, SplineBoundary
-from pathspace_graph.labels import BIG_ORANGE, NAMES
-from pathspace_graph.labels import ORANGE as ORANGE_CONE
+from pathspace_graph.labels import NAMES
 from pathspace_graph.run import ObservedCycle
 
 SUFFIX: Final = ".rrd"
 DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")  # one is set with a display, on Linux
 BAND_EVERY: Final = 10  # cycles from one band to the next: each needs the joint covariance of the map
-SAMPLES_PER_SPAN: Final = 6  # lines in each span of a curve
 PORT: Final = 9876  # the viewer's port, rerun's own; a viewer that is there already is used
 
 
@@ -161,9 +160,38 @@ class Recorder:
         self._last_pose: Array | None = None
         self._last_health = Health()
         self._closed = False
-        self._set_styles()
+        keep = partial(stream.log, static=True)
+        lines, points = rerun.LineStrips2D, rerun.Points2D
+        sides = drawing.BOUNDARY_COLORS.items()
+        pale = [(label, to_hex(0.5 + 0.5 * np.array(to_rgb(color)))) for label, color in sides]
+        styles = [  # kind, entity, colour, radius and order of drawing
+            *((lines, _path(k, "curve"), color, 1.5, MIDDLE) for k, color in sides),
+            *((lines, _path(k, "tentative"), color, 1.0, MIDDLE) for k, color in sides),
+            *((lines, _path(k, "band"), color, 0.7, LOW) for k, color in pale),
+            *((points, _path(k, "points"), color, 2.0, MIDDLE) for k, color in sides),
+            (points, _path(labels.ORANGE, "points"), RED, 2.0, MIDDLE),
+            (points, _path(labels.BIG_ORANGE, "points"), RED, 3.0, MIDDLE),
+            (lines, TRAJECTORY, GREEN, 0.7, MIDDLE),
+            (lines, WINDOW, GREEN, 2.0, HIGH),
+            (lines, VEHICLE, "#000000", 1.5, TOP),
+            (lines, FEET, DARK, 0.7, HIGH),
+            (points, f"{READINGS}/used", DARK, 3.0, TOP),
+            (points, f"{READINGS}/gated", RED, 3.0, TOP),
+            (points, f"{READINGS}/detected", GREY, 3.0, TOP),
+            (points, TRUE_CONES, LIGHT, 2.0, LOW),
+        ]
+        # the y axis of a two-dimensional view points down, as that of a picture does
+        keep(MAP, rerun.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
+        for kind, path, color, radius, order in styles:
+            radii = [rerun.Radius.ui_points(radius)]
+            keep(path, kind.from_fields(colors=[_rgb(color)], radii=radii, draw_order=order))
+        for path, color in _SERIES.items():
+            name = path.rpartition("/")[2]
+            keep(path, rerun.SeriesLines(colors=[_rgb(color)], names=[name], widths=[1.0]))
+        colors = [_rgb(drawing.HEALTH_COLORS.get(condition, GREEN)) for condition in CONDITIONS]
+        keep(HEALTH, rerun.StateConfiguration(values=list(CONDITIONS), colors=colors))
         if truth is not None and len(truth.cones):
-            self._log_static(TRUE_CONES, rerun.Points2D(truth.cones))
+            keep(TRUE_CONES, rerun.Points2D(truth.cones))
 
     def __call__(self, cycle: ObservedCycle) -> None:
         rerun, log, pose = self._rerun, self._stream.log, np.asarray(cycle.result.pose, float)
@@ -174,10 +202,10 @@ class Recorder:
         if cycle.number % BAND_EVERY == 0 or replaced:
             for label, boundary in cycle.map.boundaries.items():
                 if isinstance(boundary, SplineBoundary):
-                    u = style.curve_parameters(boundary.spline, SAMPLES_PER_SPAN)
-                    band = [*style.uncertainty_band(boundary, u)]
+                    u = drawing.curve_parameters(boundary.spline, 6)
+                    band = [*drawing.uncertainty_band(boundary, u)]
                 else:
-                    band = [*style.ellipse_outlines(boundary.points, boundary.covariance)]
+                    band = [*drawing.ellipse_outlines(boundary.points, boundary.covariance)]
                 self._lines(_path(label, "band"), band)
         self._lines(VEHICLE, [to_map(OUTLINE, np.tile(pose, (len(OUTLINE), 1)))])
         before = pose if self._last_pose is None else self._last_pose
@@ -198,40 +226,6 @@ class Recorder:
                 log(path, rerun.Scalars(value))
         self._show_messages(cycle)
 
-    def _set_styles(self) -> None:
-        rerun = self._rerun
-        lines, points = rerun.LineStrips2D, rerun.Points2D
-        pale = {k: to_hex(0.5 + 0.5 * np.array(to_rgb(color))) for k, color in BOUNDARY_COLORS.items()}
-        styles = [  # kind, entity, colour, radius and order of drawing
-            *((lines, _path(k, "curve"), color, 1.5, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
-            *((lines, _path(k, "tentative"), color, 1.0, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
-            *((lines, _path(k, "band"), color, 0.7, LOW) for k, color in pale.items()),
-            *((points, _path(k, "points"), color, 2.0, MIDDLE) for k, color in BOUNDARY_COLORS.items()),
-            (points, _path(ORANGE_CONE, "points"), RED, 2.0, MIDDLE),
-            (points, _path(BIG_ORANGE, "points"), RED, 3.0, MIDDLE),
-            (lines, TRAJECTORY, TRAJECTORY_COLOR, 0.7, MIDDLE),
-            (lines, WINDOW, TRAJECTORY_COLOR, 2.0, HIGH),
-            (lines, VEHICLE, "#000000", 1.5, TOP),
-            (lines, FEET, DARK, 0.7, HIGH),
-            (points, f"{READINGS}/used", DARK, 3.0, TOP),
-            (points, f"{READINGS}/gated", RED, 3.0, TOP),
-            (points, f"{READINGS}/detected", GREY, 3.0, TOP),
-            (points, TRUE_CONES, LIGHT, 2.0, LOW),
-        ]
-        # the y axis of a two-dimensional view points down, as that of a picture does
-        self._log_static(MAP, rerun.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
-        for kind, path, color, radius, order in styles:
-            radii = [rerun.Radius.ui_points(radius)]
-            self._log_static(path, kind.from_fields(colors=[_rgb(color)], radii=radii, draw_order=order))
-        for path, color in _SERIES.items():
-            name = path.rpartition("/")[2]
-            self._log_static(path, rerun.SeriesLines(colors=[_rgb(color)], names=[name], widths=[1.0]))
-        colors = [_rgb(HEALTH_COLORS.get(condition, GREEN)) for condition in CONDITIONS]
-        self._log_static(HEALTH, rerun.StateConfiguration(values=list(CONDITIONS), colors=colors))
-
-    def _log_static(self, path: str, what: Any) -> None:
-        self._stream.log(path, what, static=True)
-
     def _lines(self, path: str, strips: list[Array]) -> None:
         self._stream.log(path, self._rerun.LineStrips2D.from_fields(strips=strips))
 
@@ -244,7 +238,7 @@ class Recorder:
             if isinstance(boundary, PointBoundary):
                 self._points(_path(label, "points"), boundary.points)
                 continue
-            u = style.curve_parameters(boundary.spline, SAMPLES_PER_SPAN)
+            u = drawing.curve_parameters(boundary.spline, 6)
             until = boundary.confirmed_until
             confirmed, tentative = u[u <= until], u[u > until]
             if len(tentative):

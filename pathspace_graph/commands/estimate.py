@@ -21,7 +21,7 @@ from pathspace_graph.batch.mapper import BatchMapper, BatchResult
 from pathspace_graph.console import note, output, progress, say
 from pathspace_graph.errors import InputError, SettingsError, solving
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
-from pathspace_graph.eval.metrics import summary
+from pathspace_graph.eval.metrics import measures
 from pathspace_graph.eval.metrics.alignment import MapDifference, differences
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import inverse
@@ -108,7 +108,7 @@ def online_command(options: Online) -> Outcome:
         observers = [] if recorder is None else [recorder]
         mapped = map_online(log, estimator, options.estimator, observers)
         result = of_kind(with_own(mapped, parameters), options.map, options.settings)
-        summarized, changes = summary.summarize(result, log, hints), list[MapDifference]()
+        summarized, changes = measures.summarize(result, log, hints), list[MapDifference]()
         found_at = estimator.placed_at if isinstance(estimator, FixedLagMapper) else None
         if known is not None and found_at is not None:
             before = scaled(known[0], 1.0 / result.scale)
@@ -187,7 +187,7 @@ def batch_of_several(options: Batch) -> Outcome:
     drives = dict[str, Any]()
     shown = ("lap_count", "noise", "calibration", "final", "ate", "inside_two_sigma")
     for own, drive in joint.drives.items():  # with truth in the frame of each drive
-        known = summary.summarize(drive.moved(inverse(joint.frames[own])), logs[own])
+        known = measures.summarize(drive.moved(inverse(joint.frames[own])), logs[own])
         drives[own] = {"frame": joint.frames[own], **{key: known[key] for key in shown if key in known}}
     summarized = summarize_batch(result, logs[name], hints[name])
     summarized |= {"drives": drives, "left_out": joint.left_out}
@@ -248,7 +248,7 @@ def of_kind(result: Run, kind: MapKind, settings: MapperSettings) -> Run:
 def summarize_batch(result: BatchRun, log: Log, hints: Sequence[Hint] = ()) -> dict[str, Any]:
     """Summary of a run, and how its optimization began and ended."""
     start = "odometry" if isinstance(result, BatchResult) and result.online is None else "online"
-    found = summary.summarize(result, log, hints) | {"start": start, "converged": result.converged}
+    found = measures.summarize(result, log, hints) | {"start": start, "converged": result.converged}
     if not isinstance(result, BatchResult):
         return found
     found |= {"convergence": asdict(result.convergence), "objection": result.objection}
@@ -262,7 +262,7 @@ def map_online(
     observers: Sequence[Observer] = (),
 ) -> RunResult:
     """Map a log with progress; the map at the end of each true lap is kept where there is truth."""
-    times = summary.lap_times(log)
+    times = measures.lap_times(log)
     with progress("mapping", len(log.cycles)) as advance, solving("an update"):
         watching = [lambda _: advance(), *observers]
         return run_online(log, estimator, name=name, snapshot_times=times, observers=watching, outlines=True)
@@ -270,7 +270,7 @@ def map_online(
 
 def report(result: RunResult, log: Log) -> None:
     """Print the run, the paper's table where there is truth, and on standard error what was not mapped."""
-    if laps := summary.laps_of(result, log):
+    if laps := measures.laps_of(result, log):
         table = Table()
         for name in ("lap", "rmse [m]", "missed [%]", "size"):
             table.add_column(Text(name), justify="right")  # a plain text would be markup, [m] a style
@@ -290,7 +290,7 @@ def report(result: RunResult, log: Log) -> None:
     at_one = result.at_scale_one()
     say(*noise_lines(at_one.noise))
     say(*([] if at_one.vehicle is None else diagnose(at_one.vehicle, result.settings)))
-    if missing := summary.not_mapped(result.map, log):
+    if missing := measures.not_mapped(result.map, log):
         note("; ".join(missing))
 
 
@@ -303,7 +303,7 @@ def outline(result: RunResult, begin: float = 0.0) -> str:
     orange = sorted(result.map.points.items())
     cones = [f"{own.size} {NAMES[label].replace('_', ' ')} cones" for label, own in orange]
     size = [] if result.scale == 1.0 else [f"{result.scale:g} times the size of a Formula Student track"]
-    number = counts([summary.health_of(record) for record in result.cycles])
+    number = counts([measures.health_of(record) for record in result.cycles])
     reasons = Counter(record.reason for record in result.cycles if record.health == DEGRADED)
     mostly = f" (mostly: {reasons.most_common(1)[0][0]})" if reasons else ""
     health = [
@@ -311,7 +311,7 @@ def outline(result: RunResult, begin: float = 0.0) -> str:
         for condition, why in ((DEGRADED, mostly), (LOST, ""))
         if number[condition]
     ]
-    last = summary.stretches_of(result)[-1:]
+    last = measures.stretches_of(result)[-1:]
     if last and last[0].health == LOST and last[0].end == result.cycles[-1].t:
         health.append(f"still lost since {last[0].begin - begin:.1f} s ({last[0].reason})")
     return ", ".join([laps, loop, points, *cones, *size, *health])

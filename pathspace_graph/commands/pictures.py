@@ -7,8 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from pathspace_graph.errors import InputError
-from pathspace_graph.eval.figures.map_plot import plot_map
-from pathspace_graph.eval.figures.style import check_plot_file, save_plot
+from pathspace_graph.eval.figures.drawing import check_plot_file, plot_map, save_plot
 from pathspace_graph.eval.metrics.alignment import maps_apart
 from pathspace_graph.frames import read_cycles
 from pathspace_graph.io.files import atomic_file, check_file_target

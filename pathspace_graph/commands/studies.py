@@ -20,10 +20,9 @@ from pathspace_graph.eval.experiment import run as runs
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
 from pathspace_graph.eval.experiment.study import Study, find_study, log_folders, read_study_file
 from pathspace_graph.eval.experiment.tables import write_study
-from pathspace_graph.eval.figures.map_plot import plot_apart, plot_map
-from pathspace_graph.eval.figures.style import save_plot
+from pathspace_graph.eval.figures.drawing import plot_apart, plot_map, save_plot
 from pathspace_graph.eval.metrics.alignment import maps_apart
-from pathspace_graph.eval.metrics.summary import laps_of, not_mapped, summarize
+from pathspace_graph.eval.metrics.measures import laps_of, not_mapped, summarize
 from pathspace_graph.eval.report import ReportPlan, write_report
 from pathspace_graph.io.files import atomic_folder, check_target, write_json
 from pathspace_graph.io.log_files import write_log

@@ -209,8 +209,8 @@ class Log(Shown):
         )
 
     def plot(self, **options: Any) -> Figure:
-        """Draw the log; the options are those of `eval.figures.map_plot.plot_log`."""
-        figure: Figure = import_module("pathspace_graph.eval.figures.map_plot").plot_log(self, **options)
+        """Draw the log; the options are those of `eval.figures.drawing.plot_log`."""
+        figure: Figure = import_module("pathspace_graph.eval.figures.drawing").plot_log(self, **options)
         return figure
 
     @classmethod

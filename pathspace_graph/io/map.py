@@ -151,8 +151,8 @@ class Map(Shown):
         return replace(self, boundaries=boundaries, joint_covariance=joint, points=points)
 
     def plot(self, **options: Any) -> Figure:
-        """Draw the map; the options are those of `eval.figures.map_plot.plot_map`."""
-        figure: Figure = import_module("pathspace_graph.eval.figures.map_plot").plot_map(self, **options)
+        """Draw the map; the options are those of `eval.figures.drawing.plot_map`."""
+        figure: Figure = import_module("pathspace_graph.eval.figures.drawing").plot_map(self, **options)
         return figure
 
     @property

@@ -328,7 +328,11 @@ def add_hint(told: Told, better: Better | None, mistake: str, **figures: Any) ->
 
 def tell_missing(told: Told, regression: Regression, fit: Fit) -> None:
     """Tell a speed or a yaw rate that the cones show and the odometry has not."""
-    explained, (shown_v, shown_w) = regression.explained(fit), regression.around()
+    explained, motions = regression.explained(fit), regression.motions
+    # medians of successive motions, which explain what the cones show
+    columns = np.column_stack([motions.velocity.real, motions.velocity.imag, motions.rate])
+    vx, vy, shown_w = scipy.ndimage.median_filter(columns, size=(9, 1), mode="nearest").T
+    shown_v = vx + 1j * vy
     seen, (v, w) = regression.shares(shown_v, shown_w), regression.predicted(fit)
     stated_v, stated_w = regression.stated(fit.content, fit.lag)
     turn, way = far_better(seen.turn, explained.turn), far_better(seen.way, explained.way)

@@ -301,13 +301,6 @@ class Regression:
             )
         return when, before, after, jumping, constant
 
-    def around(self) -> tuple[Complex, Array]:
-        """Medians (P,) of successive motions, which explain what the cones show."""
-        v = self.motions.velocity
-        columns = np.column_stack([v.real, v.imag, self.motions.rate])
-        vx, vy, rate = scipy.ndimage.median_filter(columns, size=(9, 1), mode="nearest").T
-        return vx + 1j * vy, rate
-
 
 def in_blocks(scores: NDArray[Any]) -> NDArray[Any]:
     """Add up rows (P, ...) of a dozen successive motions, which share cycles."""

@@ -1,12 +1,16 @@
-"""Known and joint maps of simulated cars: what is driven, the metrics, and their tables."""
+"""Whole cars: known and joint maps of simulated ones, logs of a real one; what is driven, and the tables."""
 
 from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.spatial import KDTree
 
+from pathspace_graph.cli import main
 from pathspace_graph.eval.cars import (
     OTHER,
     OWN,
@@ -18,17 +22,22 @@ from pathspace_graph.eval.cars import (
     metrics_of_group,
     odds_of_track,
     odds_table,
+    real_tables,
     surveyed,
 )
 from pathspace_graph.eval.metrics.alignment import motion_onto
 from pathspace_graph.eval.metrics.measures import UNKNOWN
 from pathspace_graph.eval.metrics.reference import truth_of
 from pathspace_graph.factors.se2 import compose, move_points
+from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.places.find import SURE_ODDS
+from pathspace_graph.sim.simulate import preset, simulate
 from pathspace_graph.sim.track import to_map_frame
+from pathspace_graph.sim.track_generator import generate_track
 
 from ..batch.joint.several import alone, lap
+from ..convert.recorded import SHORT, write_recorded
 from ..scenes.kidnapped import laps_log, pear_track
 
 LOG = laps_log(pear_track())
@@ -148,3 +157,42 @@ def test_a_place_on_the_map_of_another_drive_is_held_against_the_truth() -> None
     assert not own["wrong"][own["odds"] > SURE_ODDS].any()
     assert (own["odds"] > SURE_ODDS).mean() > 0.5
     assert not (rows["odds"][rows["kind"] == OTHER] > SURE_ODDS).any()
+
+
+# --- logs of a real car ------------------------------------------------------------------------------------
+
+CONVERT = ["--from", "csv", "--columns", "label=colour", "--labels", "left=1", "right=0", "--y", "right"]
+
+
+def standing_drive() -> Log:
+    """One lap of a short track by a car with cameras that stands before it and after."""
+    settings = replace(preset({"sensor": "camera", "odometry": "ins"}), laps=1)
+    vehicle = replace(settings.vehicle, rest=4.0, stand=5.0)
+    return simulate(generate_track(np.random.default_rng(4), SHORT), replace(settings, vehicle=vehicle), 4)
+
+
+def test_real_logs_are_mapped_and_held_against_each_other(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        recorded = write_recorded(standing_drive(), tmp_path / "recorded" / name)
+        assert main(["-q", "convert", str(recorded), *CONVERT, "--out", str(tmp_path / name)]) == 0
+    logs, cells = [tmp_path / name for name in ("first", "second")], list[int]()
+    real_tables(logs, tmp_path / "out")
+    tables = real_tables(logs, tmp_path / "out", on_cell=lambda _, remaining: cells.append(remaining))
+    assert cells == [0], "what was mapped is kept"
+    online = tables["runs"].records()[0]
+    assert online["track, estimator"] == "first, fixed-lag"
+    assert online["closed [%]"] == "100"
+    assert float(online["end off by [m]"]) < 1.0
+    assert tables["maps"].records()[0] | {"landmark-fixed-lag [m]": ""} == {
+        "maps": "first, second",
+        "fixed-lag [m]": "0.00",
+        "spline [m]": "0.00",
+        "landmark-fixed-lag [m]": "",
+    }
+    first, second, both = tables["measured"].records()
+    assert [row["log"] for row in (first, second, both)] == ["first", "second", "all drives"]
+    assert both["scale [%]"].partition(" ")[0] == first["scale [%]"].partition(" ")[0]
+
+
+def test_a_report_of_real_logs_needs_some(tmp_path: Path) -> None:
+    assert main(["report", "--out", str(tmp_path), "--only", "real"]) == 2

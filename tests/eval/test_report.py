@@ -14,13 +14,7 @@ from pathspace_graph.eval import report
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.eval.experiment.tables import TextTable, by_name, contrast_table, last_laps
 from pathspace_graph.eval.metrics.measures import METRICS
-from pathspace_graph.eval.report import (
-    estimators_table,
-    laps_table,
-    rmse_table,
-    skidpad_table,
-    tracks_table,
-)
+from pathspace_graph.eval.report import estimators_table, laps_table, rmse_table, skidpad_table, tracks_table
 
 
 def frame(estimator: str, laps: int, rmse: float) -> pd.DataFrame:

@@ -144,11 +144,8 @@ MISTAKES: Final[dict[str, Callable[[Log], Log]]] = {
     "sensor frame: x to the right, y ahead": partial(in_frame, turn=-0.5 * np.pi),
     "sensor frame: x to the left": partial(in_frame, turn=0.5 * np.pi),
     "sensor frame: x to the rear": partial(in_frame, turn=np.pi),
-    "sensor frame: turned by 30 degrees": partial(in_frame, turn=30.0 * DEGREE),
-    "sensor frame: turned by 10 degrees": partial(in_frame, turn=-10.0 * DEGREE),
     "sensor frame: camera, z ahead": camera,
     "sensor frame: x and y swapped": partial(turned, to_vehicle=np.array([[0.0, 1.0], [1.0, 0.0]])),
-    "sensor frame: 2 m ahead": partial(in_frame, ahead=2.0),
     "positions in centimetres": partial(with_points, change=lambda points: 1e2 * points),
     "speeds in km/h": partial(with_twists, factors=(3.6, 3.6, 1.0)),
     "speeds always 0": partial(with_twists, factors=(0.0, 0.0, 1.0)),
@@ -173,21 +170,3 @@ MISTAKES: Final[dict[str, Callable[[Log], Log]]] = {
     ),
 }
 """Mistakes by name."""
-
-
-CAUSES: Final[dict[str, tuple[str, ...]]] = {  # that tell a mistake, by the longest beginning of its name
-    **{name: (name,) for name in ("positions", "speeds", "yaw rate", "y to the right", "stamps")},
-    **{name: (name,) for name in ("odometry", "covariances", "sides", "sensor frame")},
-    "all lengths": ("positions", "speeds"),
-    "bearings": ("unexplained",),
-    "sensor frame: 2 m ahead": ("mounting",),
-    "speeds in the map frame": ("odometry",),
-    "detections in the map frame": ("map frame",),
-    "detections 1 s late": ("clocks",),
-    "all labels": ("labels",),
-}
-
-
-def causes_of(mistake: str) -> tuple[str, ...]:
-    """Return the causes of which one must be named."""
-    return CAUSES[max((begin for begin in CAUSES if mistake.startswith(begin)), key=len)]

@@ -22,7 +22,7 @@ from pathspace_graph.sim.track_generator import generate_track
 from ..scenes.drives import ahead, corridor, detections, exact_log, short_drive
 from ..scenes.lines import line_drive
 from .good_logs import EDITED, PRESET, SIMULATED, good_log
-from .mistakes import MISTAKES, causes_of, in_frame, late, side_late, with_cycles, with_points, with_twists
+from .mistakes import MISTAKES, in_frame, late, side_late, with_cycles, with_twists
 
 SAID = {
     "positions in millimetres": ("in millimetres", "multiply x and y by 0.001"),
@@ -41,11 +41,8 @@ SAID = {
     "sensor frame: x to the right, y ahead": ("x to the right and y ahead", "y into column x and -x into"),
     "sensor frame: x to the left": ("x to the left and y to the rear", "-y into column x and x into"),
     "sensor frame: x to the rear": ("x to the rear and y to the right", "-x into column x and -y into"),
-    "sensor frame: turned by 30 degrees": ("degrees to the left in",),
-    "sensor frame: turned by 10 degrees": ("degrees to the right in",),
     "sensor frame: camera, z ahead": ("z ahead, x to the right and y down", "z into column x and -x into"),
     "sensor frame: x and y swapped": ("x and y are swapped", "y into column x and x into column y"),
-    "sensor frame: 2 m ahead": ("whose origin is not the vehicle's",),
     "positions in centimetres": ("in centimetres", "multiply x and y by 0.01"),
     "speeds in km/h": ("in km/h", "multiply vx and vy by 0.27778"),
     "yaw rate to the right": ("positive to the right", "negate column wz"),
@@ -71,15 +68,9 @@ SAID = {
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_each_mistake_is_told_by_its_cause_and_its_figure(mistake: str) -> None:
     found = hints(MISTAKES[mistake](short_drive()))
-    assert {hint.cause for hint in found} & set(causes_of(mistake)), found
     said = " ".join(f"{hint.likely}; {hint.advice}" for hint in found)
     assert [words for words in SAID[mistake] if words not in said] == [], said
     assert all("\n" not in hint.line for hint in found)
-
-
-def test_detections_that_are_stamped_too_early_are_told() -> None:
-    (found,) = hints(late(short_drive(), -0.5))
-    assert (found.cause, found.likely) == ("clocks", "the detections are stamped about 0.5 s too early")
 
 
 @pytest.mark.parametrize(("most", "told"), [(2, True), (3, False)])
@@ -120,16 +111,12 @@ def test_the_angle_of_a_turned_sensor_is_told(turn: float) -> None:
     assert ("to the left" in found.likely) == (turn > 0.0)
 
 
-def test_the_place_of_a_sensor_is_told() -> None:
-    (found,) = hints(in_frame(short_drive(), ahead=2.5, left=-1.0))
-    assert found.cause == "mounting"
+@pytest.mark.parametrize("turn", [0.0, 0.5 * np.pi])
+def test_the_place_of_a_sensor_is_told(turn: float) -> None:
+    *_, found = hints(in_frame(short_drive(), turn=turn, ahead=2.5, left=-1.0))
+    assert found.cause == "mounting" and "whose origin is not the vehicle's" in found.likely
     words = found.advice.split()
     assert [float(words[1]), float(words[5].strip(","))] == pytest.approx([2.5, -1.0], abs=0.4)
-
-
-def test_two_mistakes_are_both_told() -> None:
-    log = with_twists(with_points(short_drive(), lambda points: 1000.0 * points[:, ::-1]), (3.6, 3.6, 1.0))
-    assert [hint.cause for hint in hints(log)] == ["positions", "speeds", "sensor frame"]
 
 
 def test_a_vehicle_that_goes_backward_by_its_odometry_alone_is_told() -> None:
@@ -213,10 +200,6 @@ def test_positions_are_told_beyond_what_a_detector_sees(typical: float, said: st
     assert all(said in line for line in found)
 
 
-def test_a_log_with_hardly_any_odometry_is_not_judged() -> None:
-    assert hints(Log(Odometry(np.zeros(0), np.zeros((0, 3))), (), np.ones(3))) == []
-
-
 # --- stamps ----------------------------------------------------------------------------------------------
 
 
@@ -284,9 +267,13 @@ def test_the_unit_of_the_positions_is_told_of_lines_as_well() -> None:
 
 
 @pytest.mark.parametrize(
-    "mistake", ["speeds in the map frame, start at 137 degrees", "sensor frame: x to the rear"]
+    ("mistake", "cause"),
+    [
+        ("speeds in the map frame, start at 137 degrees", "odometry"),
+        ("sensor frame: x to the rear", "sensor frame"),
+    ],
 )
-def test_a_noise_that_was_measured_by_wrong_odometry_hides_no_mistake(mistake: str) -> None:
+def test_a_noise_that_was_measured_by_wrong_odometry_hides_no_mistake(mistake: str, cause: str) -> None:
     """It is as large as that of a drive whose cones seemed to be points of a line."""
     large = RayNoise(np.array([0.7, 0.08])), RayNoise(np.array([0.9, 0.11]))
     noise = MeasuredNoise(np.full(3, 0.01), np.zeros(3), 0.025, *large)
@@ -295,7 +282,7 @@ def test_a_noise_that_was_measured_by_wrong_odometry_hides_no_mistake(mistake: s
         lambda cycle: {"covariances": noise.covariances(cycle.points_vehicle, inflated=False)},
     )
     found = hints(replace(log, odometry_stated=False, detections_stated=False, measured=noise))
-    assert [hint.cause for hint in found] == [*causes_of(mistake)]
+    assert [hint.cause for hint in found] == [cause]
 
 
 def test_a_small_step_of_the_clock_is_told_by_its_size() -> None:
@@ -362,7 +349,7 @@ def test_rough_motion_does_not_count_as_noise() -> None:
 # --- cones, or points of lines ---------------------------------------------------------------------------
 
 
-SPEED, PERIOD, SIGMA = 10.0, 0.1, 0.05
+PERIOD, SIGMA = 0.1, 0.05
 Row = Callable[[int, float], np.ndarray]  # x (k,) of a row's points, vehicle frame, in a cycle at x (m)
 
 
@@ -382,12 +369,11 @@ def beams(cycle: int, x: float) -> np.ndarray:
     return np.arange(1.0, 21.0, 3.7)
 
 
-def drive(left: Row, right: Row, speed: float = SPEED, across: float = 0.0) -> Log:
+def drive(row: Row, speed: float = 10.0, across: float = 0.0) -> Log:
     """A straight drive between two rows, whose points are off them by up to `across` (m)."""
     rng, cycles = np.random.default_rng(0), []
     for cycle in range(250):
-        x = speed * PERIOD * cycle
-        rows = [(row(cycle, x), side) for row, side in ((left, 2.0), (right, -2.0))]
+        rows = [(row(cycle, speed * PERIOD * cycle), side) for side in (2.0, -2.0)]
         points = np.concatenate([np.column_stack([own, np.full(len(own), side)]) for own, side in rows])
         points[:, 1] += across * rng.uniform(-1.0, 1.0, len(points))
         labels = np.repeat([LEFT, RIGHT], [len(own) for own, _ in rows])
@@ -399,19 +385,37 @@ def drive(left: Row, right: Row, speed: float = SPEED, across: float = 0.0) -> L
 
 
 @pytest.mark.parametrize(
-    ("left", "right", "told"),
-    [(cones, cones, False), (line, line, True), (beams, beams, True)],
+    ("row", "how", "told"),
+    [
+        (cones, {}, False),
+        (line, {}, True),
+        (beams, {}, True),
+        (beams, {"speed": 0.0}, None),  # at rest
+        (line, {"across": 1.0}, None),  # on no line
+    ],
 )
-def test_points_that_stay_are_cones(left: Row, right: Row, told: bool | None) -> None:
-    assert is_line(drive(left, right)) is told
+def test_points_that_stay_are_cones(row: Row, how: dict[str, float], told: bool | None) -> None:
+    assert is_line(drive(row, **how)) is told
 
 
-def test_at_rest_nothing_is_told() -> None:
-    assert is_line(drive(beams, beams, speed=0.0)) is None
-
-
-def test_points_that_lie_on_no_line_are_none_of_a_line() -> None:
-    assert is_line(drive(line, line, across=1.0)) is None
+@pytest.mark.parametrize(
+    ("kind", "stated", "advice"),
+    [
+        ("line", None, ['state kind = "line", or map with --kind line']),
+        ("line", "cones", ['state kind = "line", or map with --kind line']),
+        ("line", "line", []),
+        ("cones", None, []),
+        ("cones", "cones", []),
+        ("cones", "line", ['state kind = "cones", or map with --kind cones']),
+    ],
+)
+def test_another_kind_of_sensor_than_the_stated_one_is_told(
+    kind: Kind, stated: Kind | None, advice: list[str]
+) -> None:
+    log = line_drive(1, 1.0) if kind == "line" else short_drive()
+    found = hints(replace(log, sensor=SensorInfo(kind=stated)))
+    assert [hint.advice for hint in found if hint.cause == "kind"] == advice
+    assert bool(objections(found)) is bool(advice)
 
 
 @pytest.mark.parametrize("spacing", [0.25, 1.0, 4.0])
@@ -426,17 +430,3 @@ def test_a_setting_comes_before_the_log_and_cones_are_the_default() -> None:
     }
     assert all(one.kind == (setting or stated or "cones") for (setting, stated), one in known.items())
     assert all(one.stations != one.of_lines for one in known.values())
-
-
-@pytest.mark.parametrize(("stated", "told"), [(None, True), ("cones", True), ("line", False)])
-def test_lines_that_are_not_said_to_be_some_get_a_hint(stated: Kind | None, told: bool) -> None:
-    log = replace(line_drive(1, 1.0), sensor=SensorInfo(kind=stated))
-    found = [hint for hint in hints(log) if hint.cause == "kind"]
-    assert [hint.advice for hint in found] == ['state kind = "line", or map with --kind line'] * told
-    assert bool(objections(found)) is told
-
-
-@pytest.mark.parametrize(("stated", "told"), [(None, False), ("cones", False), ("line", True)])
-def test_cones_that_are_said_to_be_lines_get_a_hint(stated: Kind | None, told: bool) -> None:
-    log = replace(short_drive(), sensor=SensorInfo(kind=stated))
-    assert ["kind" in hint.cause for hint in hints(log)] == [True] * told

@@ -1,4 +1,4 @@
-"""The project's folder, the modules of the package, and the real tracks, which not every machine has."""
+"""The project's folder, and the modules of the package."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 """The project lies in this folder."""
-TRACKS = ROOT.parent / "shared" / "tracks"
-"""Track files of other projects lie here, in a folder for each kind."""
 PACKAGE = "pathspace_graph"
 BESIDE = ("factors", "sim", "eval")
 """These folders at the root are parts of the package."""

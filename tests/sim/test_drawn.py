@@ -12,10 +12,9 @@ import pytest
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.log_files import read_log, write_log
-from pathspace_graph.sim.cameras import CAMERA, INS, DrawnCar, draw_car
 from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults
 from pathspace_graph.sim.sensor import ConeSensor, OdometryNoise, SensorSettings
-from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
+from pathspace_graph.sim.simulate import CAMERA, INS, SimulationSettings, draw_car, preset, simulate
 from pathspace_graph.sim.vehicle import VehicleSettings
 
 from ..scenes.drives import bean_track
@@ -71,7 +70,8 @@ def test_a_seed_draws_the_same_log_to_the_byte_and_another_seed_another_car(tmp_
 
 def test_the_log_of_a_drawn_car_states_nothing_and_its_truth_has_all(tmp_path: Path) -> None:
     write_log(drawn(1), tmp_path / "log")
-    log, car = read_log(tmp_path / "log"), draw_car(np.random.default_rng(1).spawn(5)[4])
+    log = read_log(tmp_path / "log")
+    car = draw_car(np.random.default_rng(1).spawn(5)[4], SimulationSettings())
     assert not log.odometry_stated and not log.detections_stated and log.measured is None
     assert (log.sensor.rate, log.sensor.range_max, log.sensor.fov) == (None, None, None)
     np.testing.assert_array_equal(log.odometry_sigma, [0.25, 0.12, 0.035])
@@ -79,7 +79,7 @@ def test_the_log_of_a_drawn_car_states_nothing_and_its_truth_has_all(tmp_path: P
     across = np.array([-y, x]) / np.hypot(x, y)
     sigma = np.sqrt(across @ log.cycles[0].covariances[0] @ across)
     assert sigma == pytest.approx(np.hypot(x, y) * np.pi / 200.0)
-    truth, sensor, faults = log.truth, car.sensor, car.sensor_faults
+    truth, sensor, faults = log.truth, car.sensor, car.faults.sensor
     assert truth is not None and truth.noise is not None
     np.testing.assert_array_equal(truth.bend, [sensor.range_bend, sensor.range_bend_from])
     np.testing.assert_array_equal(
@@ -88,9 +88,8 @@ def test_the_log_of_a_drawn_car_states_nothing_and_its_truth_has_all(tmp_path: P
     expected = [faults.yaw, faults.lateral, faults.latency, faults.range_scale, faults.range_bias]
     np.testing.assert_array_equal(truth.sensor, expected)
     np.testing.assert_array_equal(truth.noise[3:], [sensor.slow_range, sensor.slow_bearing, sensor.slow_time])
-    np.testing.assert_array_equal(
-        truth.calibration, [car.odometry_faults.speed_scale, car.odometry_faults.yaw_rate_bias]
-    )
+    errors = car.faults.odometry
+    np.testing.assert_array_equal(truth.calibration, [errors.speed_scale, errors.yaw_rate_bias])
     assert log.source["sensor.range_bend"] == str(sensor.range_bend)
     assert log.source["faults.sensor.latency"] == str(faults.latency)
 
@@ -123,9 +122,9 @@ def test_what_is_drawn_cannot_be_set_beside_it() -> None:
 
 
 @cache
-def cars() -> list[DrawnCar]:
+def cars() -> list[SimulationSettings]:
     """Each of them is valid, or its settings would have been refused."""
-    return [draw_car(rng) for rng in np.random.default_rng(0).spawn(400)]
+    return [draw_car(rng, SimulationSettings()) for rng in np.random.default_rng(0).spawn(400)]
 
 
 def test_drawn_cars_differ_in_everything_and_have_errors_of_either_sign() -> None:
@@ -135,18 +134,16 @@ def test_drawn_cars_differ_in_everything_and_have_errors_of_either_sign() -> Non
     assert 12.0 <= ranges.min() < 13.0 and 39.0 < ranges.max() <= 40.0
     for signed in (
         [car.sensor.range_bend for car in cars()],
-        [car.sensor_faults.yaw for car in cars()],
-        [car.sensor_faults.latency for car in cars()],
-        [car.sensor_faults.range_scale for car in cars()],
-        [car.odometry_faults.speed_scale for car in cars()],
+        *([getattr(car.faults.sensor, name) for car in cars()] for name in ("yaw", "latency", "range_scale")),
+        [car.faults.odometry.speed_scale for car in cars()],
     ):
         assert len(set(signed)) == len(cars())
         assert np.mean(np.array(signed) > 0.0) == pytest.approx(0.5, abs=4 * 0.5 / 20.0)
-    yaws = np.abs(np.rad2deg([car.sensor_faults.yaw for car in cars()]))
+    yaws = np.abs(np.rad2deg([car.faults.sensor.yaw for car in cars()]))
     assert np.mean(yaws > 2.9) == pytest.approx(0.25, abs=4 * 0.43 / 20.0) and yaws.max() < 7.0
-    goes_on = [car.odometry_faults.false_travel > 0.0 for car in cars()]
+    goes_on = [car.faults.odometry.false_travel > 0.0 for car in cars()]
     assert np.mean(goes_on) == pytest.approx(0.5, abs=4 * 0.5 / 20.0)
-    assert all(car.vehicle.stand > car.odometry_faults.false_travel_time for car in cars())
+    assert all(car.vehicle.stand > car.faults.odometry.false_travel_time for car in cars())
 
 
 def test_the_recorded_camera_lies_within_what_is_drawn() -> None:

@@ -14,12 +14,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.log_files import read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
-from pathspace_graph.sim.sensor import (
-    ConeSensor,
-    OdometryNoise,
-    SensorSettings,
-    measure_twists,
-)
+from pathspace_graph.sim.sensor import ConeSensor, OdometryNoise, SensorSettings, measure_twists
 from pathspace_graph.sim.simulate import CAMERA, INS, SimulationSettings, simulate
 from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import generate_track
@@ -92,7 +87,7 @@ def test_a_switch_of_one_stream_does_not_shift_the_others(track: Track) -> None:
     a = simulate(track, base, 0)
     b = simulate(track, replace(base, odometry=OdometryNoise(white=(1.0, 1.0, 1.0))), 0)
     np.testing.assert_array_equal(rows(a)[0], rows(b)[0])
-    c = simulate(track, replace(base, sensor=SensorSettings(range_bias=True)), 0)
+    c = simulate(track, replace(base, sensor=SensorSettings(range_bend=0.01)), 0)
     np.testing.assert_array_equal(a.odometry.twist, c.odometry.twist)
     np.testing.assert_array_equal(truth_of(a)[1], truth_of(c)[1])
     d = simulate(track, replace(base, sensor=SensorSettings(false_positives=0.0)), 0)
@@ -178,17 +173,6 @@ def test_false_positives_are_in_the_field_at_their_rate() -> None:
     assert set(labels.tolist()) == {LEFT, RIGHT}
 
 
-def test_range_bias_can_be_switched_on() -> None:
-    cones = np.array([[3.0, 0.0], [12.0, 0.0]])
-    for bias, expected in ((False, [0.0, 0.0]), (True, [0.02, 0.34])):
-        settings = replace(CLEAN, range_bias=bias, detection_falloff=0.0, detection_probability=1.0)
-        sensor = ConeSensor(cones, np.zeros(2, dtype=int), settings, np.random.default_rng(0))
-        measured = [
-            np.linalg.norm(sensor.detect(0.0, np.zeros(3))[0].points_vehicle, axis=1) for _ in range(2000)
-        ]
-        np.testing.assert_allclose(np.mean(measured, axis=0) - [3.0, 12.0], expected, atol=0.015)
-
-
 def test_detections_at_odd_rates_are_posed_between_odometry_stamps(track: Track) -> None:
     sensor = replace(CLEAN, rate=13.0, range_sigma=1e-6, range_sigma_growth=0.0, bearing_sigma=1e-7)
     log = simulate(track, SimulationSettings(laps=1, sensor=sensor), 0)
@@ -197,7 +181,7 @@ def test_detections_at_odd_rates_are_posed_between_odometry_stamps(track: Track)
 
 
 def test_bad_settings(track: Track) -> None:
-    for bad in ({"range_bias_at": (1.0,)}, {"fov": 7.0}, {"overlap": (2.0, 1.0)}):
+    for bad in ({"fov": 7.0}, {"overlap": (2.0, 1.0)}):
         with pytest.raises(SettingsError, match="sensor"):
             SensorSettings(**bad)  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="seed"):

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.sim.track import Track
+from pathspace_graph.sim.track import Track, fit_centre_line
 from pathspace_graph.sim.track_generator import TrackGeneratorSettings, generate_track
 
 SEEDS = range(24)
@@ -118,6 +118,14 @@ def test_start_is_on_the_middle_of_a_straight(tracks: list[Track]) -> None:
         assert np.linalg.norm(line.points(s)[0] - track.start[:2]) < 0.2
         tangent = line.tangents(s)[0]
         assert tangent @ [np.cos(track.start[2]), np.sin(track.start[2])] > np.cos(0.05)
+
+
+def test_the_middle_of_a_straight_road_that_widens_is_straight() -> None:
+    """From 4 m to 8 m: each step moves the curve by half the difference of its distances from both rows."""
+    x = np.arange(0.0, 60.0, 3.0)
+    side = np.where(x < 30.0, 2.0, 4.0)
+    line = fit_centre_line(np.column_stack([x, side]), np.column_stack([x, -side]), False, np.zeros(2))
+    assert np.abs(line.points(np.arange(0.0, line.length, STEP))[:, 1]).max() < 0.005
 
 
 @pytest.mark.parametrize("cones", [120, 300, 500])

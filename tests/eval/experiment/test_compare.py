@@ -21,7 +21,7 @@ from pathspace_graph.eval.experiment.compare import (
     tables,
     write_comparison,
 )
-from pathspace_graph.eval.figures.map_plot import plot_maps
+from pathspace_graph.eval.figures.drawing import plot_maps
 from pathspace_graph.eval.metrics.accuracy import LapMetrics
 from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.settings.mapper import MapperSettings

@@ -18,9 +18,8 @@ import pytest
 from pathspace_graph import estimators as registry
 from pathspace_graph.cli import main
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.experiment import provenance
-from pathspace_graph.eval.experiment.provenance import code_of, origin_of
-from pathspace_graph.eval.experiment.run import run_study
+from pathspace_graph.eval.experiment import run
+from pathspace_graph.eval.experiment.run import code_from, origin_of, run_study
 from pathspace_graph.eval.experiment.study import Study, read_study_file
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.io.map import PointBoundary, read_map
@@ -79,7 +78,7 @@ def forget() -> None:
     """Let this process be as one that has just been started."""
     for name in [name for name in sys.modules if name.startswith("plugin_")]:
         del sys.modules[name]
-    for cached in (provenance._code, provenance._spec, provenance._imports):
+    for cached in (code_from, run._spec, run._imports):
         cached.cache_clear()
     invalidate_caches()
     for made_by in registry.ONLINE.values():
@@ -96,55 +95,42 @@ def study(tmp_path: Path, **of: Any) -> Study:
 
 
 def test_the_code_of_an_estimator_has_what_it_imports_and_no_other_estimator() -> None:
-    code = code_of("ckf")
+    code = code_from(registry.module_of("ckf"))
     ours = {name.removeprefix("pathspace_graph.") for name in code}
     assert {"baselines.filters", "baselines.ckf", "factors._kernels", "run", "sim.simulate"} <= ours
     assert {"eval.metrics.measures", "settings.mapper", "gtsam", "numpy", "scipy"} <= ours
     assert not {"online.fixed_lag", "pandas", "sim.track_files"} & ours
-    assert "online.fixed_lag" in {name.removeprefix("pathspace_graph.") for name in code_of("fixed-lag")}
+    assert "online.fixed_lag" in {
+        name.removeprefix("pathspace_graph.") for name in code_from(registry.module_of("fixed-lag"))
+    }
 
 
 def test_a_change_of_the_kernels_is_a_change_of_the_code(tmp_path: Path) -> None:
     library = tmp_path / f"_kernels{EXTENSION_SUFFIXES[0]}"
     library.write_bytes(b"compiled")
-    digests = [provenance._digest(library)]
+    digests = [run._digest(library)]
     (tmp_path / "kernels").mkdir()
     source = tmp_path / "kernels" / "a.cpp"
     for text in ("1", "2"):
         source.write_text(text)
-        digests.append(provenance._digest(library))
+        digests.append(run._digest(library))
     assert len({*digests}) == 3
 
 
 def test_a_plugin_is_known_by_its_sources_and_those_of_its_unversioned_imports(plugin: Path) -> None:
-    code = code_of("plugin")
+    code = code_from("plugin_main")
     assert {"plugin_main", "plugin_lib", "plugin_lib.far", "pathspace_graph.io.map"} <= set(code)
     (plugin / "plugin_lib" / "far.py").write_text("AWAY = 4.0\n")
-    assert code_of("plugin") == code, "the process goes on with what it has read"
+    assert code_from("plugin_main") == code, "the process goes on with what it has read"
     forget()
-    changed = code_of("plugin")
+    changed = code_from("plugin_main")
     assert {name for name in code if code[name] != changed[name]} == {"plugin_lib.far"}
 
 
 def test_an_estimator_without_sources_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    typed = type("Typed", (), {"__module__": "__main__"})
-    monkeypatch.setitem(registry.ONLINE, "typed", typed)  # type: ignore[misc]
-    monkeypatch.setattr(provenance, "_spec", lambda name: None)
+    monkeypatch.setattr(run, "_spec", lambda name: None)
     with pytest.raises(SettingsError, match="expected one of a module with sources, found __main__"):
-        code_of("typed")
-
-
-def test_the_cells_of_a_changed_plugin_are_run_again(plugin: Path, tmp_path: Path) -> None:
-    of = study(tmp_path, estimators=("plugin", "landmark-ckf"))
-    before = run_study(of, tmp_path / "out")
-    (plugin / "plugin_lib" / "far.py").write_text("AWAY = 4.0\n")
-    forget()
-    done: list[tuple[int, int]] = []
-    after = run_study(of, tmp_path / "out", on_cell=lambda *told: done.append(told))
-    assert done[0] == (0, 1), "the other estimator's cell is used again"
-    rmse = [frame.set_index("estimator")["rmse"] for frame in (before, after)]
-    assert rmse[0]["plugin"] != rmse[1]["plugin"]
-    assert rmse[0]["landmark-ckf"] == rmse[1]["landmark-ckf"]
+        code_from("__main__")
 
 
 def test_a_worker_of_other_code_stops_the_study(
@@ -152,7 +138,7 @@ def test_a_worker_of_other_code_stops_the_study(
 ) -> None:
     """The plugin changes after the study has begun, and before a worker reads it."""
     of = study(tmp_path, estimators=("plugin",))
-    real, forgotten = provenance.check_code, []
+    real, forgotten = run.check_code, []
 
     def changed(*arguments: Any) -> None:
         if not forgotten:

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from shutil import copytree
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from pathspace_graph.errors import OutputError, SettingsError
+from pathspace_graph.errors import OutputError, SettingsError, SolveError
 from pathspace_graph.eval.experiment import run as study_run
 from pathspace_graph.eval.experiment import study as study_module
-from pathspace_graph.eval.experiment.run import run_study
-from pathspace_graph.eval.experiment.study import Study, StudyDrive
+from pathspace_graph.eval.experiment.run import rows_of, run_study
+from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.eval.experiment.tables import TIMES, without_times, write_study
-from pathspace_graph.io.log import Log
-from pathspace_graph.plausibility.judge import Hint
 
 from ...scenes.pretenders import Fragile, Pretender, contents, register, write_round_track
 
@@ -155,8 +154,8 @@ def test_cells_of_other_code_are_run_again_and_counted(
 ) -> None:
     _, first = ran
     assert study_run.of_other_code(finished, study_run.make_plan(study).cells) == 0
-    code = study_run.code_of("pretender")
-    monkeypatch.setattr(study_run, "code_of", lambda name: code | {"tests": "other"})
+    code = study_run.code_from(Pretender.__module__)
+    monkeypatch.setattr(study_run, "code_from", lambda module: code | {"tests": "other"})
     monkeypatch.setattr(study_run, "check_code", lambda *_: None)
     assert study_run.of_other_code(finished, study_run.make_plan(study).cells) == len(first)
     again = run_study(study, finished)
@@ -176,22 +175,6 @@ def test_failed_cells_are_kept_until_they_are_to_be_retried(
     calls = Fragile.calls
     assert (run_study(study, finished, retry_failed=True)["failure"] == "").all()
     assert Fragile.calls == calls + 2
-
-
-def test_a_log_that_cannot_be_simulated_fails_its_cells_only(
-    study: Study, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real = StudyDrive.load
-
-    def load(drive: StudyDrive) -> tuple[Log, Sequence[Hint]]:
-        if drive.seed == 1:
-            raise ValueError("stuck")
-        return real(drive)
-
-    monkeypatch.setattr(StudyDrive, "load", load)
-    frame = run_study(replace(study, estimators=("pretender",)))
-    assert set(frame[frame["seed"] == 1]["failure"]) == {"ValueError: stuck"}
-    assert set(frame[frame["seed"] == 0]["failure"]) == {""}
 
 
 def test_a_study_that_grows_keeps_every_cell_that_means_the_same(study: Study, finished: Path) -> None:
@@ -216,13 +199,73 @@ def test_a_folder_of_another_study_is_refused(study: Study, finished: Path, tmp_
     assert [file.name for file in (tmp_path / "thesis").iterdir()] == ["thesis.tex"]
 
 
-def test_a_study_that_cannot_be_planned_leaves_no_folder(
+# --- other processes ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def real(track: Path) -> Study:
+    """A study that other processes can run: they know no pretenders."""
+    return Study(tracks=(track,), laps=1, grids=({"lag": [1.0]},))
+
+
+@pytest.fixture(scope="module")
+def alone(real: Study) -> pd.DataFrame:
+    """Its results from this process."""
+    frame = run_study(real)
+    assert (frame["failure"] == "").all()
+    assert frame["jump"].notna().any(), "the batch of a lap replaces the map, which takes another process"
+    return without_times(frame)
+
+
+@pytest.mark.slow
+def test_processes_give_the_same_as_one(real: Study, alone: pd.DataFrame) -> None:
+    pd.testing.assert_frame_equal(without_times(run_study(real, jobs=2)), alone)
+
+
+@pytest.fixture
+def cluster() -> Iterator[str]:
+    distributed = pytest.importorskip("distributed", reason="dask isn't installed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as local:
+        yield local.scheduler_address
+
+
+def test_a_dask_cluster_gives_the_same(real: Study, alone: pd.DataFrame, cluster: str) -> None:
+    pd.testing.assert_frame_equal(without_times(run_study(real, cluster=cluster)), alone)
+
+
+def test_a_cluster_that_is_not_there_is_refused(
+    real: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed", reason="dask isn't installed")
+    monkeypatch.setattr("pathspace_graph.eval.experiment.run.CONNECT_SECONDS", 0.3)
+    with pytest.raises(SettingsError, match=r"tcp://127\.0\.0\.1:9"):
+        run_study(real, tmp_path / "out", cluster="tcp://127.0.0.1:9")
+    assert not (tmp_path / "out").exists()
+
+
+TENFOLD = """
+import os
+
+
+def tenfold(item):
+    if item == 3:
+        os._exit(7)
+    return [{"item": item, "times": 10 * item}]
+"""
+"""A module of rows, each ten times an item; three kills its process."""
+
+
+def test_a_worker_that_dies_takes_only_its_own_work_with_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(*_: object) -> NoReturn:
-        raise SettingsError("no")
-
-    monkeypatch.setattr(study_run, "load_tracks", fail)
-    with pytest.raises(SettingsError):
-        run_study(Study(tracks=(0,)), tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+    (tmp_path / "module").mkdir()
+    (tmp_path / "module" / "tenfold_rows.py").write_text(TENFOLD, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path / "module")  # other processes cannot import the tests
+    tenfold = import_module("tenfold_rows").tenfold
+    with pytest.raises(SolveError, match=r"^3: WorkerDiedError: .*EXIT\(7\)"):
+        rows_of(tenfold, [{"item": item} for item in range(6)], tmp_path, jobs=2)
+    assert len([*(tmp_path / "cells").iterdir()]) == 6
+    left = rows_of(tenfold, [{"item": item} for item in (0, 1, 2, 4, 5)], tmp_path)
+    assert left["times"].tolist() == [0, 10, 20, 40, 50]

@@ -15,6 +15,7 @@ from pathspace_graph.eval.experiment.run import add_batch
 from pathspace_graph.eval.experiment.study import Baseline, Published, Study, find_study, read_study_file
 from pathspace_graph.eval.experiment.tables import (
     RUN,
+    TextTable,
     beside_published,
     by_track,
     caption,
@@ -26,20 +27,17 @@ from pathspace_graph.eval.experiment.tables import (
     plot_differences,
     plot_published,
     summary_tables,
+    track_tables,
     wilcoxon_p,
     write_study,
 )
-from pathspace_graph.eval.figures.style import Picture
-
-
-def test_few_values_have_no_interval_and_equal_ones_none_to_speak_of() -> None:
-    mean, half = estimate(np.array([-2.0]))
-    assert mean == -2.0 and np.isnan(half)
-    assert np.isnan(estimate(np.zeros(0))[0])
-    assert estimate(np.ones(2)) == (1.0, 0.0)
+from pathspace_graph.eval.figures.drawing import Picture
+from pathspace_graph.eval.metrics.measures import METRICS
 
 
 def test_the_interval_of_few_and_p_are_those_of_scipy() -> None:
+    assert estimate(np.ones(2)) == (1.0, 0.0)
+    np.testing.assert_equal([estimate([-2.0]), estimate([])], [(-2.0, np.nan), (np.nan, np.nan)])
     values = np.random.default_rng(1).normal(0.3, 1.0, 7)
     mean, half = estimate([*values, np.nan])  # what isn't known doesn't count
     low, high = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
@@ -99,13 +97,7 @@ def rows(
                     made.append(shared | {"lap": None, "failure": "ValueError: lost"})
                     continue
                 for lap in (1, 2):
-                    rmse = (
-                        5.0 * int(str(track))
-                        + seed
-                        + by
-                        + 0.01 * rng.standard_normal()
-                        + (9.0 if lap == 1 else 0.0)
-                    )
+                    rmse = 5.0 * int(str(track)) + seed + by + 0.01 * rng.standard_normal() + 9.0 * (lap == 1)
                     figures = {"rmse": rmse, "missed": 0.0, "size": 80, "ms_mean": 3.0 + by}
                     made.append(shared | {"lap": lap, "failure": ""} | figures)
     return pd.DataFrame(made)
@@ -186,6 +178,7 @@ def test_tables_tell_the_same_in_every_form(frame: pd.DataFrame) -> None:
     tables, told = summary_tables(STUDY, frame), caption(STUDY, frame)
     assert [table.title for table in tables] == ["rmse [m]", "missed [%]", "size"]
     assert len(tables[0].frame) == 6
+    assert tables[0].records()[1]["Wilcoxon"] == "0.125"  # of four tracks that differ alike: 2 / 2^4
     assert "Holm" in told
     assert "paired" in told
     text, markdown, latex = (joined(tables, told, form) for form in ("txt", "md", "tex"))
@@ -193,19 +186,10 @@ def test_tables_tell_the_same_in_every_form(frame: pd.DataFrame) -> None:
     for written in (text, markdown, latex):
         assert "lag=1" in written
         assert f"{worse:+.3f}" in written
+    assert r"100 \%" in latex and r"loud\_one" in latex and latex.count(r"\begin{table}") == 3
     significant = [line for line in text.splitlines() if line.endswith("*")]
     assert len(significant) == 2
     assert all("lag=1" in line for line in significant)
-
-
-def test_latex_is_escaped(frame: pd.DataFrame) -> None:
-    latex = joined(summary_tables(STUDY, frame), caption(STUDY, frame), "tex")
-    assert r"100 \%" in latex
-    assert r"loud\_one" in latex
-    assert r"$\pm$" in latex
-    assert latex.isascii()
-    assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 3
-    assert {line.count(" & ") for line in latex.splitlines() if line.endswith(r"\\")} == {7}
 
 
 def test_figures_of_what_differs(frame: pd.DataFrame) -> None:
@@ -252,6 +236,8 @@ def test_every_lap_is_compared_with_the_batch_of_its_own_log_and_settings() -> N
         row("fixed-lag", seed=1, turn=0.003, rmse=0.4),
         row("fixed-lag", variant="other", turn=0.003, rmse=0.4),
         row("spline", variant="other", turn=0.004, rmse=0.4),
+        row("fixed-lag", variant="failed", turn=0.003, rmse=0.4),
+        row("spline", variant="failed"),
     ]
     add_batch(rows, (*RUN, "noise", "variant"))
     found = [(row.get("turn_from_batch"), row.get("rmse_by_batch")) for row in rows]
@@ -259,14 +245,8 @@ def test_every_lap_is_compared_with_the_batch_of_its_own_log_and_settings() -> N
         (pytest.approx(0.002), pytest.approx(2.0)),
         (pytest.approx(0.001), pytest.approx(1.5)),
     ]
-    assert found[2] == found[3] == found[5] == (None, None)  # the batch itself, and a run without one
+    assert {found[k] for k in (2, 3, 5, 6)} == {(None, None)}  # the batch itself, and without one that worked
     assert found[4] == (pytest.approx(-0.001), pytest.approx(1.0))
-
-
-def test_a_batch_that_failed_compares_with_nothing() -> None:
-    rows = [row("fixed-lag", turn=0.003, rmse=0.4), row("spline")]
-    add_batch(rows, (*RUN, "noise", "variant"))
-    assert "turn_from_batch" not in rows[0]
 
 
 # --- beside a publication --------------------------------------------------------------------------------
@@ -277,15 +257,10 @@ def published(*estimators: str) -> tuple[Study, pd.DataFrame]:
     laps = {name: {"missed": [10.0 * (k + 1), 0.0], "rmse": [1.0, 4.0]} for k, name in enumerate(estimators)}
     about = Published("a paper", laps, {"rmse": "other track"})
     study = Study(tracks=(0, 1), estimators=estimators, laps=2, published=about)
+    same = {"study": "made up", "seed": 0, "noise": "nominal", "variant": "default"}
     rows = [
-        {
-            "study": "made up",
-            "track": track,
-            "seed": 0,
-            "noise": "nominal",
-            "estimator": name,
-            "variant": "default",
-        }
+        same
+        | {"track": track, "estimator": name}
         | {"lap": lap, "failure": "", "rmse": lap * (k + 1) / (1 + i), "missed": 0.1 * (k + 1)}
         for i, track in enumerate(("a", "b"))
         for k, name in enumerate(estimators)
@@ -333,3 +308,88 @@ def test_the_table_of_the_paper_is_shipped() -> None:
     assert ratio["size"][-1] == pytest.approx(0.44, abs=1e-3)
     for of_laps in laps.values():
         np.testing.assert_allclose(of_laps["size_share"], np.array(of_laps["size"]) / 2.0)
+
+
+# --- tables by track, and the forms of any table -----------------------------------------------------------
+
+RUNS = {  # rmse (m) of laps 1, 2 and 3
+    ("oval", 0): (0.6, 0.2, 0.1),
+    ("oval", 1): (0.8, 0.4, 0.3),
+    ("bean", 0): (0.2, 0.2, 0.5),
+}
+
+
+def runs_of(failed: tuple[str, int] | None = None, variant: str = "default") -> pd.DataFrame:
+    """The results of the runs above."""
+    rows = []
+    for (track, seed), values in RUNS.items():
+        shared = {
+            "track": track,
+            "seed": seed,
+            "noise": "nominal",
+            "estimator": "fixed-lag",
+            "variant": variant,
+        }
+        if (track, seed) == failed:
+            rows.append(shared | {"lap": None, "rmse": None, "failure": "ValueError: no"})
+        else:
+            laps = enumerate(values, start=1)
+            rows += [shared | {"lap": lap, "rmse": value, "failure": ""} for lap, value in laps]
+    return pd.DataFrame(rows).astype({"lap": "Int64"})
+
+
+def table(of: pd.DataFrame, metric: str = "rmse") -> dict[str, tuple[str, ...]]:
+    """The one table's rows by their name."""
+    (found,) = track_tables(Study(tracks=(0,), metrics=(metric,)), of)
+    assert tuple(found.frame) == ("track", "runs", METRICS[metric].heading)
+    return {str(row[0]): row[1:] for row in found.frame.itertuples(index=False, name=None)}
+
+
+def test_a_track_has_the_mean_of_its_last_laps_and_every_run_counts_the_same_in_all() -> None:
+    assert table(runs_of()) == {
+        "oval": ("2 of 2", "0.200"),
+        "bean": ("1 of 1", "0.500"),
+        "all": ("3 of 3", "0.300"),
+    }
+
+
+def test_a_failed_run_is_counted_and_has_no_value() -> None:
+    assert table(runs_of(failed=("oval", 1)))["oval"] == ("1 of 2", "0.100")
+    assert table(runs_of(failed=("bean", 0)))["bean"] == ("0 of 1", "–")
+
+
+def test_a_last_lap_without_a_value_is_not_that_of_the_lap_before() -> None:
+    runs = runs_of()
+    runs.loc[(runs["track"] == "bean") & (runs["lap"] == 3), "rmse"] = float("nan")
+    assert table(runs)["bean"] == ("1 of 1", "–")
+
+
+def test_every_combination_has_a_table_of_its_own() -> None:
+    both = pd.concat([runs_of(), runs_of(variant="lag=1")])
+    study = Study(tracks=(0,), grids=({"lag": [1.0]},))
+    assert [found.title for found in track_tables(study, both)] == ["default", "lag=1"]
+
+
+def test_a_table_keeps_its_units_and_escapes_what_latex_would_take_for_commands() -> None:
+    rows = (("x|y", "2σ < 5 %"), ("z", "–"), ("z", "–"))
+    table = TextTable.of(("name", "rmse [m]"), rows, "50 % of a_b ± 1")
+    assert table.rich().columns[1].header.plain == "rmse [m]"  # type: ignore[union-attr]
+    latex = table.latex()
+    assert r"\caption{50 \% of a\_b $\pm$ 1}" in latex and r"2$\sigma$ < 5 \%" in latex
+    assert latex.count(r"\midrule") == 1 and "{lr}" in latex and latex.isascii()
+
+
+def test_names_are_aligned_to_the_left_and_numbers_to_the_right() -> None:
+    table = TextTable.of(("name", "a", ""), (("x|y", "1.0", ""), ("long name", "12.25", "*")), "Title")
+    assert [line.rstrip() for line in table.text().splitlines()] == [
+        "Title",
+        "",
+        "name           a",
+        "---------  -----  --",
+        "x|y          1.0",
+        "long name  12.25   *",
+    ]
+    lines = table.text("md").split("\n")
+    assert lines[:2] == ["Title", ""] and lines[-1] == ""
+    assert lines[3] == "|:----------|------:|---:|"
+    assert lines[4] == r"| x\|y      |   1.0 |    |"

@@ -26,7 +26,7 @@ from pathspace_graph.eval.experiment.study import (
     study_from,
     track_digest,
 )
-from pathspace_graph.eval.metrics.summary import lap_times
+from pathspace_graph.eval.metrics.measures import lap_times
 from pathspace_graph.settings.checked import leaves, override
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.simulate import CAMERA, CAMERA_FAULTS, INS, INS_RATE, SimulationSettings, simulate
@@ -95,13 +95,8 @@ def test_variants_that_come_to_the_same_are_run_once() -> None:
         "lag=3, spline.degree=2",
         "steps=2",
     ]
-    same = study('tracks = [0]\nbaseline.variant = "lag=3"\ngrid.lag = [1.0, 3.0]')
-    assert same.baseline_variant == "default"
-
-
-def test_values_of_a_grid_that_are_nearly_the_same_are_kept_apart() -> None:
-    names = list(study("tracks = [0]\ngrid.lag = [1.0, 1.00000001]").points)
-    assert names == ["default", "lag=1", "lag=1.00000001"]
+    same = study('tracks = [0]\nbaseline.variant = "lag=3"\ngrid.lag = [1.0, 3.0, 1.00000001]')
+    assert same.baseline_variant == "default" and [*same.points] == ["default", "lag=1", "lag=1.00000001"]
 
 
 def test_from_python_as_from_a_file() -> None:
@@ -109,22 +104,16 @@ def test_from_python_as_from_a_file() -> None:
     assert made == study(
         'tracks = [0, "oval.csv"]\nseeds = [3, 4]\nestimators = ["fixed-lag"]\ngrid.lag = [1.0]'
     )
-
-
-def test_all_estimators() -> None:
     assert study('tracks = [0]\nestimators = "all"').estimators == tuple(known_estimators())
 
 
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("seeds = [0]", "tracks: expected"),
-        ("tracks = []", "tracks: expected at least one"),
+        ("seeds = [0]", "tracks: expected at least one"),
         ("tracks = [0, 0]", "none twice"),
-        ("tracks = [[0]]", "tracks: expected whole numbers"),
         ("tracks = [-1]", "tracks: expected whole numbers"),
         ("tracks = [0]\nseeds = 3", "seeds: expected a list"),
-        ("tracks = [0]\nseeds = [0.5]", "seeds: expected whole numbers"),
         ("tracks = [0]\nlaps = 0", "laps: expected a positive whole number"),
         ("tracks = [0]\nlaps = true", "laps: expected a whole number"),
         ("tracks = [0]\nlap = 1", "found 'lap', the nearest is 'laps'"),
@@ -132,26 +121,19 @@ def test_all_estimators() -> None:
         ('tracks = [0]\nestimators = ["fixed-leg"]', "found 'fixed-leg', the nearest is 'fixed-lag'"),
         ('tracks = [0]\nmetrics = ["rsme"]', "found 'rsme', the nearest is 'rmse'"),
         ("tracks = [0]\ngrid.spline.degre = [1]", "found 'spline.degre', the nearest is 'spline.degree'"),
-        ("tracks = [0]\ngrid.lag = 1.0", "grid.lag: expected a list"),
         ("tracks = [0]\ngrid.lag = []", "grid.lag: expected a list"),
-        ('tracks = [0]\ngrid.lag = ["long"]', "grid.lag: expected a positive number, found 'long'"),
         ("tracks = [0]\ngrid.lag = [-1.0]", "grid.lag: expected a positive number, found -1.0"),
-        ("tracks = [0]\ngrid.steps = [1.5]", "grid.steps: expected a positive whole number"),
-        ("tracks = [0]\ngrid.spline = [1]", "found 'spline'"),
         ("tracks = [0]\nvariants.default.lag = 1.0", "variants.default: that name is kept"),
         ("tracks = [0]\nvariants.fast = 1", "variants.fast: expected a table"),
         ('tracks = [0]\ngrid.lag = [1.0]\nvariants."lag=1".steps = 2', "expected every name once"),
-        ("tracks = [0]\nnoise.loud.sensor.bearing_sgima = 1.0", "the nearest is 'sensor.bearing_sigma'"),
         ("tracks = [0]\nnoise.loud.odometry.white = [1.0]", "noise.loud.odometry.white: expected"),
         ("tracks = [0]\nnoise.loud.laps = 3", "noise.loud.laps: expected laps as a key"),
         ('tracks = [0]\nbaseline.variant = "defualt"', "found 'defualt', the nearest is 'default'"),
         ('tracks = [0]\nbaseline.estimator = "spline"', "baseline.estimator: expected one of the study's"),
         ('tracks = [0]\nbaseline.settings = "x"', "baseline: expected a known key"),
-        ("tracks = [0]\npublished = 1", "published: expected a table"),
         ('tracks = [0]\npublished.note = "x"', "published: Object contains unknown field `note`"),
         ("tracks = [0]\npublished.laps.ckf.rmse = [1.0]", "published.laps: expected one of the study's"),
         ("tracks = [0]\npublished.laps.fixed-lag.rsme = [1]", "found 'rsme', the nearest is 'rmse'"),
-        ('tracks = [0]\npublished.laps.fixed-lag.rmse = ["x"]', "published: Expected `float`, got `str`"),
     ],
 )
 def test_what_is_unknown_or_wrong_is_refused(text: str, says: str) -> None:

@@ -16,8 +16,7 @@ from pathspace_graph import BatchMapper, FixedLagMapper, Log, MapperSettings, Ru
 from pathspace_graph.eval.experiment.run import make_plan
 from pathspace_graph.eval.experiment.study import Study
 from pathspace_graph.eval.figures.notebook import html, sections, warnings
-from pathspace_graph.eval.metrics.measures import METRICS, measure
-from pathspace_graph.eval.metrics.summary import lap_times, summarize
+from pathspace_graph.eval.metrics.measures import METRICS, lap_times, measure, summarize
 from pathspace_graph.health import DEGRADED
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.plausibility.judge import Hint

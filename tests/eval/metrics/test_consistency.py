@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.eval.metrics.accuracy import true_curve
-from pathspace_graph.eval.metrics.consistency import (
+from pathspace_graph.eval.metrics.accuracy import (
     Deviation,
     aligned,
     consistency_at_cones,
@@ -16,6 +15,7 @@ from pathspace_graph.eval.metrics.consistency import (
     map_nees,
     normal_errors,
     similarity_from_truth,
+    true_curve,
     with_marginals,
 )
 from pathspace_graph.eval.metrics.measures import measure
@@ -165,16 +165,6 @@ def ring_truth() -> Truth:
     return truth(left, right)
 
 
-def test_landmarks_turn_as_curves_do() -> None:
-    points = np.array([[5.0, 2.0], [20.0, 2.0], [40.0, -3.0]])
-    turned = PointBoundary(points @ rotation(0.02).T, np.eye(6))
-    found = turn_from_truth(Map(False, {LEFT: turned}, 0.1**2 * np.eye(6)), truth(points))
-    assert found.value == pytest.approx(0.02, abs=1e-9)
-    # each landmark moves by 0.1 m, and the lever arms are their distances from the start
-    assert found.sigma == pytest.approx(0.1 / np.sqrt(29.0 + 404.0 + 1609.0))
-    assert found.nees == pytest.approx((0.02 / found.sigma) ** 2)
-
-
 def test_the_errors_of_a_straight_weigh_by_their_lever() -> None:
     """A straight that is 0.1 m too far left has the turn of the least squares fit through the start."""
     track = Map(False, {LEFT: line(2.1, 0.0, 100.0)})
@@ -190,14 +180,15 @@ def test_a_map_that_is_turned_and_too_large_has_both(angle: float, scale: float)
     assert (turn.value, size.value) == pytest.approx((angle, scale), abs=1e-7)
 
 
-def test_landmarks_that_only_grow_have_no_turn_and_the_scale_s_sigma() -> None:
+def test_landmarks_turn_and_grow_as_curves_do() -> None:
+    """Each landmark moves by 0.1 m, and the lever arms are their distances from the start."""
     points = np.array([[5.0, 2.0], [20.0, 2.0], [40.0, -3.0]])
-    grown = PointBoundary(1.01 * points, np.eye(6))
-    turn, scale = similarity_from_truth(Map(False, {LEFT: grown}, 0.1**2 * np.eye(6)), truth(points))
-    assert turn.value == pytest.approx(0.0, abs=1e-9)
-    assert scale.value == pytest.approx(np.log(1.01), abs=1e-9)
-    # each landmark moves by 0.1 m, and the lever arms are their distances from the start
-    assert scale.sigma == pytest.approx(0.1 / (1.01 * np.sqrt(29.0 + 404.0 + 1609.0)))
+    moved = PointBoundary(1.01 * points @ rotation(0.02).T, np.eye(6))
+    turn, scale = similarity_from_truth(Map(False, {LEFT: moved}, 0.1**2 * np.eye(6)), truth(points))
+    sigma = 0.1 / (1.01 * np.sqrt(29.0 + 404.0 + 1609.0))
+    assert (turn.value, turn.sigma) == (pytest.approx(0.02, abs=1e-9), pytest.approx(sigma))
+    assert (scale.value, scale.sigma) == (pytest.approx(np.log(1.01), abs=1e-9), pytest.approx(sigma))
+    assert turn.nees == pytest.approx((0.02 / sigma) ** 2)
 
 
 def test_the_rmse_without_turn_and_scale_is_that_of_the_shape() -> None:
@@ -212,15 +203,13 @@ def test_the_rmse_without_turn_and_scale_is_that_of_the_shape() -> None:
 def test_the_sigma_comes_from_the_joint_covariance() -> None:
     """Control points that only turn together about the start have exactly the turn's own variance."""
     track = rings()
-    points = np.concatenate([b.spline.distinct_control_points for b in spline_boundaries(track)])
+    points = np.concatenate(
+        [b.spline.distinct_control_points for b in track.boundaries.values() if isinstance(b, SplineBoundary)]
+    )
     by_angle = np.column_stack([-points[:, 1], points[:, 0]]).ravel()
     found = turn_from_truth(rings(covariance=0.01**2 * np.outer(by_angle, by_angle)), ring_truth())
     assert found.sigma == pytest.approx(0.01, rel=1e-6)
     assert np.isnan(turn_from_truth(track, ring_truth()).sigma)
-
-
-def spline_boundaries(track: Map) -> list[SplineBoundary]:
-    return [boundary for boundary in track.boundaries.values() if isinstance(boundary, SplineBoundary)]
 
 
 def test_what_is_beyond_an_open_end_or_not_mapped_does_not_count() -> None:

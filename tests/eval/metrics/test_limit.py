@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmarks import solve_landmarks
 from pathspace_graph.eval.metrics.accuracy import root_mean_square
 from pathspace_graph.eval.metrics.reference import (
     landmark_rmse,
@@ -23,7 +22,6 @@ from pathspace_graph.eval.metrics.trajectory import position_rms, trajectory_err
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.labels import LEFT, UNKNOWN
-from pathspace_graph.settings.mapper import CalibrationSettings, MapperSettings, OdometrySettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
 from pathspace_graph.sim.sensor import OdometryNoise, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -51,48 +49,6 @@ def test_with_noise_of_a_millimetre_the_batch_is_as_exact() -> None:
     assert len(solved.landmarks) > 60
     assert landmark_rmse(solved, truth_of(log)) < 0.003
     assert position_rms(trajectory_errors(system.chain.stamps, solved.variables.poses, truth_of(log))) < 0.003
-
-
-CERTAIN = MapperSettings(
-    odometry=OdometrySettings(sigma_scale=1e-9, sigma_bias=1e-9),
-    calibration=CalibrationSettings(sensor=False),
-)
-"""A vehicle that stands turns by its yaw rate's bias, unless that is known."""
-
-
-def standing_log(detections: Array, covariances: Array) -> Log:
-    """A vehicle that stands and knows it, and sees one point once a cycle."""
-    n = len(detections)
-    cycles = tuple(
-        Detections(0.1 * k, detections[k : k + 1], covariances[k : k + 1], np.array([UNKNOWN]))
-        for k in range(n)
-    )
-    odometry = Odometry(np.array([0.0, 0.1 * n]), np.zeros((2, 3)))
-    return Log(odometry, cycles, np.full(3, 1e-9))
-
-
-def test_a_landmark_seen_standing_is_the_information_weighted_mean(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(OdometrySettings, "sigmas_start", (1e-6, 1e-6, 1e-6))
-    rng = np.random.default_rng(0)
-    roots = rng.normal(0.0, 2e-3, (8, 2, 2)) + 1e-3 * np.eye(2)
-    covariances = roots @ np.swapaxes(roots, 1, 2)
-    detections = np.array([3.0, -4.0]) + np.einsum("kij,kj->ki", roots, rng.normal(0.0, 1.0, (8, 2)))
-    system, solved = solve_landmarks(standing_log(detections, covariances), np.zeros(8, dtype=int), CERTAIN)
-    weights = np.linalg.inv(covariances)
-    covariance = np.linalg.inv(weights.sum(axis=0))
-    mean = covariance @ np.einsum("kij,kj->i", weights, detections)
-    np.testing.assert_allclose(solved.landmarks, [mean], atol=2e-5)
-    found = system.eliminated(solved).joint(solved.keys)
-    np.testing.assert_allclose(found, covariance, atol=0.05 * covariance.max())
-
-
-def test_false_positives_are_left_out_and_colours_not_looked_at() -> None:
-    detections = np.array([[5.0, 1.0], [50.0, 50.0], [5.0, 1.2]])
-    covariances = np.tile(1e-4 * np.eye(2), (3, 1, 1))
-    _, solved = solve_landmarks(standing_log(detections, covariances), np.array([7, -1, 7]), CERTAIN)
-    np.testing.assert_array_equal(solved.numbers, [7])
-    np.testing.assert_allclose(solved.landmarks, [[5.0, 1.1]], atol=1e-3)
-    assert solved.variables.poses.shape == (3, 3)
 
 
 def test_unknown_cones_are_not_counted() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -61,11 +61,7 @@ def test_every_lap_has_a_row_and_the_whole_run_is_the_last() -> None:
     true = circle_truth()
     lap, whole = measure(run(true), log(true), (7.0, 6.0))
     assert (lap["lap"], whole["lap"]) == (1, None)
-    assert (lap["closed"], whole["closed"], whole["closed_at_end"]) == (
-        False,
-        True,
-        True,
-    )
+    assert (lap["closed"], whole["closed"], whole["closed_at_end"]) == (False, True, True)
     assert [r["rmse"] for r in (lap, whole)] == [pytest.approx(0.4), pytest.approx(0.3)]
     assert [r["missed"] for r in (lap, whole)] == [0.5, 0.5]  # the right boundary isn't mapped
     assert (whole["size"], whole["size_share"]) == (4, 4 / 6)
@@ -137,6 +133,10 @@ def test_a_loop_closes_falsely_before_the_drive_is_back(closed_at: float | None,
     )
     closed = Map(closed_at is not None, made.map.boundaries)
     assert closes_falsely(replace(made, cycles=cycles, map=closed), true) is false
+    batch = BatchRun("made", {}, closed, STAMPS, made.trajectory, made.cycles, 0)  # which closes at its end
+    open_drive = replace(true, pose_t=true.pose_t[:400], poses=true.poses[:400])
+    assert not closes_falsely(batch, true) and closes_falsely(batch, open_drive) is (closed_at is not None)
+    assert measure(batch, log(open_drive))[-1]["false_closing"] is (closed_at is not None)
 
 
 def test_the_jump_is_that_of_the_cycle_that_replaced_the_map() -> None:
@@ -147,17 +147,6 @@ def test_the_jump_is_that_of_the_cycle_that_replaced_the_map() -> None:
     cycles = (*made.cycles[:30], replace(made.cycles[30], jump=(0.3, -0.4, 0.1)), *made.cycles[31:])
     (*_, whole) = measure(replace(made, cycles=cycles), log(true))
     assert whole["jump"] == pytest.approx(0.5)
-
-
-def test_a_map_that_closes_on_an_open_drive_is_false() -> None:
-    true = circle_truth()
-    part = replace(true, pose_t=true.pose_t[:400], poses=true.poses[:400])
-    made = run(true)
-    batch = BatchRun("made", {}, made.map, STAMPS, made.trajectory, made.cycles, 0)
-    assert closes_falsely(batch, part) and not closes_falsely(batch, true)
-    assert not closes_falsely(replace(batch, map=Map(False, {})), part)
-    (*_, whole) = measure(batch, log(part))
-    assert whole["false_closing"] is True
 
 
 def test_a_signed_error_has_a_root_mean_square() -> None:
@@ -172,21 +161,11 @@ def test_a_metric_is_shown_in_its_unit() -> None:
     assert METRICS["missed"].heading == "missed [%]" and METRICS["size"].heading == "size"
     assert METRICS["missed"].text(0.125) == "12.5" and METRICS["bytes"].text(1640.0) == "1.64"
     assert Metric("k", "t").text(float("nan")) == "–"
-    assert {key for key, metric in METRICS.items() if metric.time == "wall"} == {
-        "ms_mean",
-        "ms_p99",
-        "seconds",
-    }
+    of_the_wall = {key for key, metric in METRICS.items() if metric.time == "wall"}
+    assert of_the_wall == {"ms_mean", "ms_p99", "seconds"}
 
 
 # --- what a run says of itself ---------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Judged(CycleRecord):
-    """A record of an estimator that judges its health."""
-
-    health: str = "good"
 
 
 def test_the_health_of_the_cycles_is_counted_where_it_is_told() -> None:
@@ -194,7 +173,7 @@ def test_the_health_of_the_cycles_is_counted_where_it_is_told() -> None:
     made = run(true)
     assert not any(name.startswith("reported") for name in measure(made, log(true))[-1])
     told = ["good"] * 20 + ["degraded"] * 12 + ["lost"] * 8
-    cycles = tuple(Judged(k, t, 0.001, 4, 0, 0, 1, health=told[k]) for k, t in enumerate(STAMPS))
+    cycles = tuple(CycleRecord(k, t, 0.001, 4, 0, 0, 1, health=told[k]) for k, t in enumerate(STAMPS))
     whole = measure(replace(made, cycles=cycles), log(true))[-1]
     assert (whole["reported_degraded"], whole["reported_lost"]) == (0.3, 0.2)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pathspace_graph.eval.metrics.summary import lap_times, laps_of, not_mapped, summarize
+from pathspace_graph.eval.metrics.measures import lap_times, laps_of, not_mapped, summarize
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.io.log import Detections, Log, Odometry, Truth
 from pathspace_graph.io.map import Map

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -17,12 +19,11 @@ from pathspace_graph.eval.metrics.trajectory import (
     trajectory_errors,
     vehicle_errors,
 )
-from pathspace_graph.factors.se2 import compose, to_map
-from pathspace_graph.io.log import Detections, Odometry, Truth
+from pathspace_graph.factors.se2 import compose
+from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import VehicleState
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.run import CycleResult, ObservedCycle
 from pathspace_graph.spline.bspline import BSpline
 
 from .straight_maps import landmarks, line
@@ -53,10 +54,7 @@ def test_a_vehicle_is_lost_that_is_5_m_off_in_the_last_second() -> None:
         poses[50, 1] = 20.0
         poses[t > 8.9, 1] = at_end
         found = end_of_trajectory(t, poses, true)
-        assert found == {
-            "error_max": pytest.approx(20.0),
-            "lost_at_end": lost,
-        }
+        assert found == {"error_max": pytest.approx(20.0), "lost_at_end": lost}
     assert end_of_trajectory(t + 100.0, path, true) == {}
 
 
@@ -128,42 +126,10 @@ def straight_map(left: float, right: float, by: float = 0.0) -> Map:
     return Map(False, {LEFT: line(2.0 + by, 0.0, left), RIGHT: line(-2.0 + by, 0.0, right)})
 
 
-def moved(track: Map, motion: Array) -> Map:
-    boundaries = {}
-    for label, boundary in track.boundaries.items():
-        assert isinstance(boundary, SplineBoundary)
-        points = boundary.spline.control_points
-        spline = boundary.spline.with_points(to_map(points, np.tile(motion, (len(points), 1))))
-        boundaries[label] = SplineBoundary(spline, boundary.covariance)
-    return Map(track.closed, boundaries)
-
-
-def at(pose: Array, t: float = 2.0) -> CycleResult:
-    return CycleResult(t, pose, (4, 4), 0, False)
-
-
-class Drawn:
-    """An estimator that has nothing but a map."""
-
-    def __init__(self, track: Map) -> None:
-        self.settings = None
-        self.track = track
-
-    def update(self, odometry: Odometry, detections: Detections) -> CycleResult:
-        raise NotImplementedError
-
-    def map(self) -> Map:
-        return self.track
-
-
-def seen(result: CycleResult, track: Map) -> ObservedCycle:
-    none = Detections(result.t, np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, int))
-    return ObservedCycle(Drawn(track), none, result)
-
-
 def observed(track: Map, pose: Array, t: float = 2.0) -> list[float]:
-    observer = ReachObserver(straight_truth())
-    observer(seen(at(pose, t), track))
+    observer, cycle = ReachObserver(straight_truth()), SimpleNamespace(result=SimpleNamespace(t=t, pose=pose))
+    cycle.outline = track
+    observer(cycle)  # type: ignore[arg-type]
     return list(observer.rows[0])
 
 
@@ -176,7 +142,7 @@ def test_the_reach_ends_at_the_first_true_cone_that_is_off_the_shorter_side() ->
 
 def test_the_map_is_seen_from_the_estimated_pose() -> None:
     true, drift = np.array([20.0, 0.0, 0.0]), np.array([3.0, -1.0, 0.4])
-    swung = moved(straight_map(50.0, 41.0), drift)
+    swung = straight_map(50.0, 41.0).moved(drift)
     assert observed(swung, compose(drift, true)) == pytest.approx(
         observed(straight_map(50.0, 41.0), true), abs=1e-9
     )

@@ -16,9 +16,9 @@ import pandas as pd
 import pytest
 
 from pathspace_graph.cli import main
-from pathspace_graph.eval.figures.style import curve_parameters, uncertainty_band
+from pathspace_graph.eval.figures.drawing import curve_parameters, uncertainty_band
 from pathspace_graph.eval.metrics.alignment import maps_apart
-from pathspace_graph.eval.metrics.summary import summarize
+from pathspace_graph.eval.metrics.measures import summarize
 from pathspace_graph.frames import run_frame
 from pathspace_graph.health import DEGRADED, LOST
 from pathspace_graph.io.map import Map, SplineBoundary, map_to_json

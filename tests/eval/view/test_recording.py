@@ -16,13 +16,7 @@ from pathspace_graph.errors import OutputError, SettingsError
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.view import recording as entities
 from pathspace_graph.eval.view import recording as module
-from pathspace_graph.eval.view.recording import (
-    BAND_EVERY,
-    DISPLAYS,
-    check_recording,
-    dashes,
-    recording,
-)
+from pathspace_graph.eval.view.recording import BAND_EVERY, DISPLAYS, check_recording, dashes, recording
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import LEFT, RIGHT
