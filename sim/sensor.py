@@ -83,6 +83,12 @@ class SensorSettings(Checked):
     sigma_range_scale: AtLeast0 = 0.0005
     """Standard deviation of the scale error of the ranges (-) that the log states, as of a calibrated sensor;
     with 0 it states none."""
+    range_bias: bool = False
+    """Whether ranges have a systematic error, as those of cameras do."""
+    range_bias_at: tuple[float, ...] = (4.0, 9.0)
+    """Increasing ranges of the given systematic errors (m), which are linear between them."""
+    range_bias_values: tuple[float, ...] = (0.02, 0.34)
+    """Systematic errors at those ranges (m), typical of cameras."""
     range_bend: Signed = 0.0
     """Bend k of the ranges (1/m): a range r reads `k (r - range_bend_from)^2` longer beyond that range."""
     range_bend_from: AtLeast0 = 9.0
@@ -111,6 +117,10 @@ class SensorSettings(Checked):
         least, greatest = self.overlap
         if not 0.0 <= least < greatest:
             raise SettingsError(f"sensor.overlap: expected 0 <= least < greatest, found {self.overlap}")
+        at, values = self.range_bias_at, self.range_bias_values
+        if not 0 < len(at) == len(values) or not np.all(np.diff(at) > 0):
+            expected = "expected increasing ranges, one for each of range_bias_values"
+            raise SettingsError(f"sensor.range_bias_at: {expected}")
 
     def range_sigmas(self, ranges: Array) -> Array:
         return self.range_sigma + self.range_sigma_growth * ranges
@@ -123,9 +133,10 @@ class SensorSettings(Checked):
         """Probabilities of detection at true ranges (m,)."""
         return np.clip(self.detection_probability - self.detection_falloff * ranges, 0.0, 1.0)
 
-    def bent(self, ranges: Array) -> Array:
-        """Lengths (m,) by which true ranges (m,) are read too long, in m."""
-        return np.asarray(self.range_bend * np.maximum(ranges - self.range_bend_from, 0.0) ** 2)
+    def systematic_errors(self, ranges: Array) -> Array:
+        """Systematic errors (m,) of true ranges (m,), in m."""
+        errors = np.interp(ranges, self.range_bias_at, self.range_bias_values) if self.range_bias else 0.0
+        return np.asarray(errors + self.range_bend * np.maximum(ranges - self.range_bend_from, 0.0) ** 2)
 
 
 def measure_twists(twists: Array, dt: float, noise: OdometryNoise, rng: Generator) -> tuple[Array, Array]:
@@ -212,7 +223,7 @@ class ConeSensor(Sensor):
         hit = chance < settings.probabilities(ranges)
         overlap = np.digitize(np.abs(bearings), settings.overlap) == 1
         rows = np.stack([hit, hit & overlap & (again < settings.duplicates)])
-        ranges = (1.0 + scale) * ranges + bias + settings.bent(ranges)
+        ranges = (1.0 + scale) * ranges + bias + settings.systematic_errors(ranges)
         # errors (2, 2, m) of unit variance by camera, range or bearing, and cone; each cone's slow ones are
         # Gauss-Markov processes that go on while it is not seen
         share, white = (
@@ -320,7 +331,7 @@ class LineSensor(Sensor):
         points = points + normals * (self._line.sigma_across * across)[:, None]
         ranges, bearings = seen_from(pose, points)
         seen = settings.is_inside(ranges, bearings) & (chance < settings.probabilities(ranges))
-        ranges = (1.0 + scale) * ranges + bias + settings.bent(ranges)
+        ranges = (1.0 + scale) * ranges + bias + settings.systematic_errors(ranges)
         ranges = ranges + settings.range_sigmas(ranges) * along
         bearings = bearings + settings.bearing_sigma * bearing
         labels = self._labels[nearest]

@@ -173,6 +173,13 @@ def test_false_positives_are_in_the_field_at_their_rate() -> None:
     assert set(labels.tolist()) == {LEFT, RIGHT}
 
 
+def test_range_bias_can_be_switched_on() -> None:
+    settings = replace(SensorSettings(range_bias=True), range_bend=0.0)
+    ranges = np.array([3.0, 6.5, 12.0])
+    np.testing.assert_allclose(settings.systematic_errors(ranges), [0.02, 0.18, 0.34])
+    assert not SensorSettings().systematic_errors(ranges).any()
+
+
 def test_detections_at_odd_rates_are_posed_between_odometry_stamps(track: Track) -> None:
     sensor = replace(CLEAN, rate=13.0, range_sigma=1e-6, range_sigma_growth=0.0, bearing_sigma=1e-7)
     log = simulate(track, SimulationSettings(laps=1, sensor=sensor), 0)
@@ -181,7 +188,7 @@ def test_detections_at_odd_rates_are_posed_between_odometry_stamps(track: Track)
 
 
 def test_bad_settings(track: Track) -> None:
-    for bad in ({"fov": 7.0}, {"overlap": (2.0, 1.0)}):
+    for bad in ({"range_bias_at": (1.0,)}, {"fov": 7.0}, {"overlap": (2.0, 1.0)}):
         with pytest.raises(SettingsError, match="sensor"):
             SensorSettings(**bad)  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="seed"):
