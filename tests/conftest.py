@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 from pathspace_graph import FixedLagMapper
-from pathspace_graph.loop import worker
+from pathspace_graph.loop import lap_solver
 from pathspace_graph.run import CycleResult
 
 from .shared import laps
@@ -39,7 +39,7 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture(scope="session", autouse=True)
 def _laps_are_solved_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worker, "submit", laps.submit)
+        patch.setattr(lap_solver, "submit", laps.submit)
         yield
 
 

@@ -17,7 +17,7 @@ from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT
 from pathspace_graph.loop.closed import Closed
 from pathspace_graph.loop.drive import DriveRecord
-from pathspace_graph.loop.map_repair import REPAIRED
+from pathspace_graph.loop.known_loop import REPAIRED
 from pathspace_graph.loop.open import Open
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.online.fixed_lag import _Before

@@ -103,7 +103,7 @@ def test_help_waits_for_no_heavy_library(command: str) -> None:
 
 
 def test_an_estimator_does_not_wait_for_what_reads_files() -> None:
-    homes = ("online.fixed_lag", "batch.mapper", "loop.worker", "ros.node", "sim.simulate")
+    homes = ("online.fixed_lag", "batch.mapper", "loop.lap_solver", "ros.node", "sim.simulate")
     loaded = modules_after(f"import {', '.join(f'pathspace_graph.{home}' for home in homes)}")
     assert not loaded & {"pandas", "pathspace_graph.io.tables"}
 

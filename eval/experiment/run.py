@@ -40,7 +40,7 @@ from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.parsing import read_json, shown
 from pathspace_graph.io.results import RunResult, commit_of, machine, now, write_result
 from pathspace_graph.lengths import times
-from pathspace_graph.loop.worker import end_with
+from pathspace_graph.loop.lap_solver import end_with
 from pathspace_graph.plausibility.diagnosis import diagnose
 from pathspace_graph.run import run_online, with_own
 from pathspace_graph.settings.checked import leaves

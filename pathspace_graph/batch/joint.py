@@ -46,10 +46,9 @@ from pathspace_graph.settings.mapper import MapperSettings, Start, known_setting
 from .association import locate_poses
 from .lap import disagreement
 from .mapper import BatchMapper, BatchResult, Found, frame_of_drive, map_of, result_of, with_wider_priors
-from .optimizer import Optimizer
 from .simplification import boundary_of
 from .start import REVISIT_INTERVAL
-from .system import BatchSystem
+from .system import BatchSystem, Optimizer
 
 
 @dataclass(frozen=True, eq=False)

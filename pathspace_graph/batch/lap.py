@@ -39,10 +39,9 @@ from pathspace_graph.spline.boundary import (
 )
 from pathspace_graph.spline.bspline import BSpline
 
-from .optimizer import Convergence, Effort, Optimizer, Stage
 from .simplification import map_block, own_settings, simplified
 from .start import StartMap, aligned_odometry, start_odometry
-from .system import BatchSystem, Evaluation, weak_priors
+from .system import BatchSystem, Convergence, Effort, Evaluation, Optimizer, Stage, weak_priors
 
 FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, tolerance=10.0)  # limited, to finish in time
 FROM_ODOMETRY: Final = Effort(rounds=24, tolerance=10.0)

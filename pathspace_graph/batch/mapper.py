@@ -36,16 +36,23 @@ from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE_LENGTHS
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import known_noise, vehicle_of, with_inflated_priors, with_size
-from pathspace_graph.mapping.orange import OrangeDetections, orange_cones
 from pathspace_graph.mapping.state import State
+from pathspace_graph.mapping.tracks import OrangeDetections, orange_cones
 from pathspace_graph.run import Stopwatch, settings_dict, solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .lap import evidence_against, unmapped
-from .optimizer import Convergence, Optimizer
 from .simplification import Scatter, Simplified, map_block, own_settings, simplified
 from .start import CurveMapper, find_revisits, start_odometry, start_online
-from .system import BatchSystem, Evaluation, OwnFactors, drive_factors, nonlinear_graph
+from .system import (
+    BatchSystem,
+    Convergence,
+    Evaluation,
+    Optimizer,
+    OwnFactors,
+    drive_factors,
+    nonlinear_graph,
+)
 
 NAME: Final = "spline"  # name of the estimator on the command line
 

@@ -1,4 +1,4 @@
-"""The closed map prepared for comparison with detections, and the evidence of detections on the estimate."""
+"""The closed map compared with detections: their evidence on the estimate, and repair."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,17 +8,30 @@ from typing import Final
 import numpy as np
 from scipy.spatial import KDTree
 
+from pathspace_graph.batch.lap import LapMarginal
+from pathspace_graph.batch.simplification import fit_through
+from pathspace_graph.batch.start import StartMap
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.bspline import SpanPolynomials
+from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle
 from pathspace_graph.front_end.front_end import Reading
+from pathspace_graph.front_end.sides import ROW_GAP
 from pathspace_graph.graph.gaussian import half_solve
+from pathspace_graph.graph.smoother import place_again
 from pathspace_graph.graph.variables import POSE
 from pathspace_graph.health import SHARE_DEGRADED, Evidence
 from pathspace_graph.io.map import NO_CONES
-from pathspace_graph.labels import BOUNDARIES, LEFT, RIGHT
+from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT
+from pathspace_graph.loop.closing import SIGMA_STEP
+from pathspace_graph.mapping.curve_map import CurveMap
+from pathspace_graph.mapping.path import along_and_across
 from pathspace_graph.mapping.smoother import CurveSmoother, Gating
 from pathspace_graph.mapping.state import SAMPLE
+from pathspace_graph.mapping.tracks import Tracks, linked
+from pathspace_graph.settings.mapper import MapperSettings
+from pathspace_graph.spline.boundary import ahead_of, sampled
+from pathspace_graph.spline.bspline import BSpline
 
 BESIDE_CURVE: Final = 1.0  # distance from the closed curve within which an unused detection is explained (m)
 GAP_RATIO: Final = 3.0  # least distance of neighbouring cones beside a gap, over the median distance
@@ -166,3 +179,250 @@ def _sigma_of_position(smoother: CurveSmoother) -> float:
 def _by_boundary(labels: IntArray) -> tuple[int, int]:
     left, right = np.bincount(labels, minlength=len(BOUNDARIES)).tolist()
     return left, right
+
+
+# --- repair -------------------------------------------------------------------------------------------------
+
+
+REPAIRED: Final = "the map was repaired"  # beginning of the notice of a repair
+SIGHTINGS: Final = 6  # least number of detections of a contradiction; clutter has 1, a passed cone 20
+REPAIR_MEMORY: Final = 30.0  # time without a detection after which a contradiction is forgotten (s)
+CONES: Final = 3  # least number of contradictions of a repaired stretch
+REPAIR_BESIDE: Final = 0.5  # distance from a curve within which a cone does not contradict it (m)
+CERTAIN: Final = 1.0  # largest sigma of a detection that may contradict the map (m)
+SETTLE: Final = 1.5  # time without detections after which a cone counts as passed (s)
+MOST: Final = 20  # number of passed contradictions from which a stretch is repaired before its end
+REPAIR_INTERVAL: Final = 1.0  # time between searches for contradictions (s)
+REPAIRS: Final = 8  # largest number of attempts
+REPLACED: Final = 0.5  # prior standard deviation of moved control points of a known map (m)
+BEND: Final = 0.1  # weight of the second differences of their moves
+LEFT_OUT: Final = 2.0  # distance from a repaired curve beyond which a cone of the earlier curve is lost (m)
+EXPLAINED: Final = 0.5  # least share of the contradictions that a repaired map must explain
+
+
+@dataclass(frozen=True, eq=False)
+class ContradictedStretch:
+    """Row of cones of a boundary's colour that are not on its curve."""
+
+    label: int
+    cones: Array  # (k, 2) positions in m, map frame, unordered
+
+
+class MapRepair(Copyable):
+    """The cones that contradict a closed map, and attempts to repair it."""
+
+    def __init__(self, settings: MapperSettings) -> None:
+        self.tracks = Tracks(settings.growth.merge_radius, REPAIR_MEMORY)
+        """Cones that no curve of the map explains."""
+        self._stretches: list[ContradictedStretch] = []
+        self._lap: Array = np.zeros((0, 3))  # poses of the newest lap at the start of the attempt
+        self._mapped = dict[int, Array]()  # cones (k, 2) on each curve at the start of the attempt
+        self._asked = -np.inf
+        self._wait_until = 0.0
+        self._attempts = 0
+
+    def observe(self, track: CurveMap, loop: Loop, new: slice, t: float) -> None:
+        """Add the new coloured detections at t (s) that are unused, or used in a gap of their curve."""
+        detections, rows = track.detections, np.arange(new.start, new.stop)
+        unexplained = ~detections.used[new]
+        for label in loop.with_gaps():
+            on = np.flatnonzero(detections.used[new] & (detections.boundary[new] == label))
+            if len(on):
+                unexplained[on] = ~loop.is_mapped(label, detections.u[rows[on]])
+        rows = rows[unexplained]
+        if len(rows):
+            covariances = detections.covariances_map(rows, track.variables)
+            certain = np.linalg.eigvalsh(covariances)[:, -1] < CERTAIN**2
+            rows, covariances = rows[certain], covariances[certain]
+            points = detections.points_map(rows, track.variables)
+            self.tracks.add(points, covariances, detections.label[rows], t)
+
+    def stretches(self, loop: Loop, t: float) -> list[ContradictedStretch]:
+        """Return the stretches whose cones contradict the loop or are in a gap, once all cones are passed.
+
+        A long stretch is complete with `MOST` passed cones.
+        """
+        found, tracks = list[ContradictedStretch](), self.tracks
+        for label in BOUNDARIES:
+            chosen = tracks.confirmed(label, SIGHTINGS)
+            if len(chosen) < CONES:
+                continue
+            away = {
+                b: curve.query(tracks.points[chosen])[0] > REPAIR_BESIDE for b, curve in loop.curves.items()
+            }
+            in_gap = loop.beside_gaps(np.full(len(chosen), label), tracks.points[chosen])
+            chosen = chosen[(away[label] | in_gap) & away[LEFT + RIGHT - label]]
+            chosen = chosen[tracks.undisputed(chosen, label)]
+            if len(chosen) < CONES:
+                continue
+            points, passed = tracks.points[chosen], tracks.last_t[chosen] < t - SETTLE
+            for row in (row for row in linked(points, ROW_GAP) if len(row) >= CONES):
+                if not passed[row].all() and passed[row].sum() < MOST:
+                    return []
+                found.append(ContradictedStretch(label, points[row[passed[row]]]))
+        return found
+
+    def is_due(self, known: KnownLoop, smoother: CurveSmoother, t: float, driven: float) -> bool:
+        """Whether a repair is due at t (s), after a path of length `driven` (m)."""
+        if t < self._asked + REPAIR_INTERVAL or driven < self._wait_until or self._attempts >= REPAIRS:
+            return False
+        loop, self._asked = known.of(smoother), t
+        self._stretches = self.stretches(loop, t)
+        if self._stretches:
+            longest = max(boundary.length for boundary in smoother.map.state.boundaries.values())
+            self._attempts, self._wait_until = self._attempts + 1, driven + longest
+        return bool(self._stretches)
+
+    def begin(self, smoother: CurveSmoother, poses: Array) -> StartMap:
+        """Return the initial map of the batch, with the poses (P, 3) of all cycles."""
+        smoother.refresh()
+        track, state = smoother.map, smoother.map.state
+        longest = max(boundary.length for boundary in state.boundaries.values())
+        self._lap = poses[lap_begin(poses, longest) :]
+        self._mapped = {label: mapped_cones(track, label) for label in state.boundaries}
+        splines = {label: refitted(track, label, self._stretches, poses) for label in state.boundaries}
+        return StartMap(splines, poses, state.variables.calibrations.copy())
+
+    def in_place(self, smoother: CurveSmoother) -> str:
+        """Refit the curves of a known map through the contradicting cones; return the notice.
+
+        The prior of the control points there is dropped. No batch can replace the map, since the drive has
+        not covered it.
+        """
+        stretches, self._stretches = self._stretches, []
+        smoother.refresh()
+        replaced = [stretch for stretch in stretches if replace_stretch(smoother, stretch)]
+        self.tracks.clear()
+        if not replaced:
+            return ""
+        smoother.reassociate()
+        for _ in range(smoother.map.settings.closing.iterations):
+            smoother.step(SIGMA_STEP)
+        self._wait_until = 0.0
+        names = [NAMES[label] for label in BOUNDARIES if any(one.label == label for one in replaced)]
+        count = sum(len(stretch.cones) for stretch in replaced)
+        return f"{REPAIRED}: it passes through {count} other cones on the {' and on the '.join(names)}"
+
+    def end(self, marginal: LapMarginal | None) -> str:
+        """End an attempt; return its notice, which is empty if the batch does not repair the map.
+
+        It must explain half of the contradictions, and no fewer cones than it takes from the curves.
+        """
+        stretches, self._stretches = self._stretches, []
+        if marginal is None:
+            return ""
+        now, explained = marginal.poses[len(marginal.poses) - len(self._lap) :], [0, 0]
+        curves = {label: KDTree(sampled(spline, SAMPLE)) for label, spline in marginal.splines.items()}
+
+        def distances(label: int, cones: Array) -> Array:
+            return np.asarray(curves[label].query(carried(cones, self._lap, now))[0])
+
+        for stretch in stretches:
+            near = distances(stretch.label, stretch.cones) < REPAIR_BESIDE
+            explained[stretch.label] += int(np.count_nonzero(near))
+        lost = sum(int(np.sum(distances(label, old) > LEFT_OUT)) for label, old in self._mapped.items())
+        if sum(explained) < max(EXPLAINED * sum(len(stretch.cones) for stretch in stretches), lost):
+            return ""
+        self._wait_until = 0.0
+        self.tracks.clear()
+        names = [NAMES[label] for label in BOUNDARIES if explained[label]]
+        return f"{REPAIRED}: {sum(explained)} more cones on the {' and on the '.join(names)} lie on it"
+
+
+def replace_stretch(smoother: CurveSmoother, stretch: ContradictedStretch) -> bool:
+    """Refit a closed curve through the cones of a stretch, on its own knots; return whether they fit.
+
+    The moved control points get a wide prior, and the cones there lose their stations.
+    """
+    state, label, cones = smoother.map.state, stretch.label, stretch.cones
+    boundary, points = state.boundaries[label], state.control_points(label)
+    u = boundary.find_anywhere(points, cones).u
+    middle = np.angle(np.exp(2j * np.pi * u / boundary.length).mean()) * boundary.length / (2.0 * np.pi)
+    within = ahead_of(middle, u, boundary.length)
+    low, high = within.min() - ROW_GAP, within.max() + ROW_GAP
+
+    def is_there(at: Array) -> BoolArray:
+        beyond = ahead_of(middle, at, boundary.length)
+        return np.asarray((beyond > low) & (beyond < high))
+
+    tables = boundary.tables
+    moved, every = np.flatnonzero(is_there(boundary.abscissae)), np.arange(tables.low, tables.high, SAMPLE)
+    held = every[~is_there(every)]
+    at, targets = np.append(u, held), np.concatenate([cones, boundary.evaluate(points, held)])
+    basis = boundary.basis(at)[:, moved]
+    bend = BEND * np.diff(np.eye(len(moved)), 2, axis=0)
+    off = np.concatenate([targets - boundary.evaluate(points, at), np.zeros((len(bend), 2))])
+    change = np.linalg.lstsq(np.concatenate([basis, bend]), off, rcond=None)[0]
+    left = np.hypot(*(off[: len(u)] - basis[: len(u)] @ change).T)
+    if np.count_nonzero(left < REPAIR_BESIDE) < EXPLAINED * len(u):
+        return False
+    place_again(smoother, state.control_keys(label)[moved], points[moved] + change, REPLACED)
+    smoother.map.forget_cones(label, is_there)
+    return True
+
+
+def carried(points: Array, before: Array, after: Array) -> Array:
+    """Move points (k, 2) rigidly with the nearest pose, from `before` to `after` (n, 3)."""
+    nearest = KDTree(before[:, :2]).query(points)[1]
+    return to_map(to_vehicle(points, before[nearest]), after[nearest])
+
+
+def refitted(track: CurveMap, label: int, stretches: list[ContradictedStretch], poses: Array) -> BSpline:
+    """Fit the closed curve of a boundary through its cones, with those of the stretches replaced.
+
+    The cones are ordered by the newest lap of the poses (P, 3).
+    """
+    state, settings = track.state, track.settings
+    chosen = [stretch for stretch in stretches if stretch.label == label]
+    if not chosen:
+        return state.spline(label)
+    cones = mapped_cones(track, label)
+    lap, stations = newest_lap(poses, state.boundaries[label].length)
+    at = along_and_across(cones, lap, stations)[0]
+    for stretch in chosen:
+        new_at = along_and_across(stretch.cones, lap, stations)[0]
+        kept = ~_is_replaced(cones, at, stretch.cones, new_at, settings)
+        cones, at = np.concatenate([cones[kept], stretch.cones]), np.append(at[kept], new_at)
+    if len(cones) < settings.spline.min_size:
+        return state.spline(label)
+    return fit_through(cones[np.argsort(at)], True, settings, settings.batch.dense_share)[0]
+
+
+def mapped_cones(track: CurveMap, label: int) -> Array:
+    """Return the cones (k, 2) on the curve of a boundary, or points at regular distances on a line."""
+    boundary, spacing = track.state.boundaries[label], track.settings.spline.spacing
+    u = track.cones.get(label, NO_CONES)[:, 0]
+    if len(u) == 0:
+        u = np.arange(boundary.tables.low, boundary.tables.high, spacing)
+    return boundary.evaluate(track.state.control_points(label), u)
+
+
+def newest_lap(poses: Array, length: float) -> tuple[Array, Array]:
+    """Return positions (n, 2) and stations (n,) of the newest lap; the last position repeats the first."""
+    first = lap_begin(poses, length)
+    lap = np.concatenate([poses[first:, :2], poses[first : first + 1, :2]])
+    return lap, path_lengths(lap)
+
+
+def lap_begin(poses: Array, length: float) -> int:
+    """Return the index of the pose (P, 3) nearest to the newest one, about a lap (m) earlier."""
+    driven = path_lengths(poses)
+    before = np.flatnonzero(np.abs(driven[-1] - driven - length) < 0.5 * length)
+    away = np.hypot(*(poses[before, :2] - poses[-1, :2]).T)
+    return int(before[away.argmin()]) if len(before) else 0
+
+
+def _is_replaced(cones: Array, at: Array, row: Array, row_at: Array, settings: MapperSettings) -> BoolArray:
+    """Whether cones (k, 2) at stations (k,) coincide with a row (r, 2), or lie beside it.
+
+    A row that leads across the neck of a hairpin does not replace the cones of the hairpin.
+    """
+    order, beside = np.argsort(row_at), REPAIR_BESIDE
+    away = np.abs(along_and_across(cones, row[order], row_at[order])[1])
+    ends = np.sort(np.concatenate([[-np.inf], row_at - beside, row_at + beside, [np.inf]]))
+    after = ends.searchsorted(at)
+    within = (
+        ends[after] - ends[after - 1] < 2.0 * ROW_GAP
+    )  # along the drive: less on the inner side of a bend
+    same = KDTree(row).query(cones)[0] < settings.growth.merge_radius
+    return np.asarray(same | (within & (away > beside)))

@@ -1,4 +1,4 @@
-"""The open road: its map grows, and where road is driven again, a batch of the drive replaces it."""
+"""The open map, which a batch of the drive closes; and a vehicle not yet found on a known map."""
 
 from dataclasses import replace
 from math import inf
@@ -7,6 +7,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from pathspace_graph.batch.association import LINE_STEP
+from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.start import REVISIT_INTERVAL, StartMap
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array
@@ -14,11 +15,17 @@ from pathspace_graph.factors.se2 import path_lengths, to_vehicle
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.rows import Revisit
+from pathspace_graph.health import DEGRADED, GOOD, Health
+from pathspace_graph.io.map import Map
+from pathspace_graph.loop.closed import Closed, Search, widened
+from pathspace_graph.loop.drive import Drive, DriveRecord, Phase, Step
+from pathspace_graph.loop.lap_solver import Outcome, Unsolved
 from pathspace_graph.mapping.path import HEADING
-from pathspace_graph.mapping.road import Road
+from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.places.find import (
     NEARBY,
     NEWEST_PATHS,
+    KnownRoad,
     Prior,
     SampledCurves,
     newest_place,
@@ -26,11 +33,6 @@ from pathspace_graph.places.find import (
     revisit_of,
 )
 from pathspace_graph.settings.mapper import MapperSettings
-
-from .closed import Closed
-from .drive import Drive, DriveRecord, Phase, Step
-from .lap_solver import Outcome
-from .worker import Unsolved
 
 STAYS_OPEN: Final = "the loop stays open"  # beginning of the notice without a batch that agrees
 REVISITED: Final = "the road was driven before: the open map was optimized with the earlier pass"
@@ -236,3 +238,56 @@ def have_parted(poses: Array, stations: Array, place: int) -> bool:
         points = np.column_stack([np.interp(at, stations, poses[:, k]) for k in range(2)])
         ways.append(to_vehicle(points, poses[cycle][None]))
     return bool((np.hypot(*(ways[0] - ways[1]).T) > DIVERGED).any())
+
+
+# --- not yet found on a known map ---------------------------------------------------------------------------
+
+
+SEEKING: Final = "the vehicle is not found on the known map yet"  # reason of the health during the search
+PLACED: Final = "the vehicle is found on the known map"  # notice of the localization
+
+
+class Seeking(Phase):
+    """Search for the vehicle's place on a known map, with an open road of its own."""
+
+    def __init__(
+        self, settings: MapperSettings, track: Map, start: Array | None = None, keep: bool = False
+    ) -> None:
+        self.known = known = KnownMap.of(track, keep, settings.of_lines)
+        self.start = start  # (3,) start pose of the drive on the known map, if given
+        self.own: Phase = Open(settings)
+        self._road = KnownRoad.of(known.splines, known.cones)
+        self._search: Search | None = None
+
+    def judge(
+        self, road: Road, drive: Drive, classified: Classified, reading: Reading
+    ) -> tuple[Phase, Health]:
+        """Judge the own road, and record the detections for the search."""
+        self.own, health = self.own.judge(road, drive, classified, reading)
+        if self._search is None:
+            self._search = Search(road, self._road, self.start)
+        self._search.look(road, classified, reading)
+        return self, Health(DEGRADED, SEEKING) if health.condition == GOOD else health
+
+    def step(self, road: Road, drive: Drive, reading: Reading, spent: float) -> Step:
+        """Replace the own road by the known map once its place is found; otherwise continue with it."""
+        step = self.own.step(road, drive, reading, spent)
+        if step.jump is not None:
+            self._search = None  # the recorded path is no longer valid
+        self.own = step.phase
+        if road.closed:
+            return step
+        place = None if drive.rests(road) or self._search is None else self._search.find()
+        if place is None:
+            return Step(self, step.jump, step.notice, step.health)
+        jump = drive.take_known(road, self.known, place.pose, widened(place))
+        phase = Closed(road, drive) if self.known.closed else OnOpenMap()
+        return Step(phase, jump, "; ".join(filter(None, [step.notice, PLACED])), Health(DEGRADED, PLACED))
+
+    def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
+        """Continue from a batch of the own road."""
+        return self.own.take(road, drive, outcome)
+
+
+class OnOpenMap(Phase):
+    """Localization on a known open map, which is refined and grows past a tentative end."""

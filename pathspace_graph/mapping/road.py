@@ -19,9 +19,9 @@ from pathspace_graph.spline.boundary import Boundary
 
 from .growth import GROWTH_REACH, Growth
 from .motion import MeasuredMotion, predict
-from .orange import OrangeDetections, orange_cones
 from .path import DrivenPath
 from .smoother import CurveSmoother, Gating
+from .tracks import OrangeDetections, orange_cones
 
 HELD: Final = "the user's factors fix the frame of the open map: it is no longer relinearized as a whole"
 

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import are_of_cones, objection, share_used
 from pathspace_graph.batch.mapper import BatchMapper, find_closed_optimum
-from pathspace_graph.batch.optimizer import Optimizer
 from pathspace_graph.batch.simplification import own_settings
 from pathspace_graph.batch.start import find_revisits
-from pathspace_graph.batch.system import BatchSystem
+from pathspace_graph.batch.system import BatchSystem, Optimizer
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.io.log import Detections, Log

@@ -17,9 +17,8 @@ from pathspace_graph.batch.lap import (
     solve_lap,
 )
 from pathspace_graph.batch.mapper import BatchMapper
-from pathspace_graph.batch.optimizer import Effort
 from pathspace_graph.batch.start import StartMap
-from pathspace_graph.batch.system import BatchSystem, Evaluation, weak_priors
+from pathspace_graph.batch.system import BatchSystem, Effort, Evaluation, weak_priors
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.front_end.front_end import judge_log

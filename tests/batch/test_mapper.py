@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from pathspace_graph.batch import mapper as batch_mapper
 from pathspace_graph.batch.lap import unmapped
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
-from pathspace_graph.batch.optimizer import Convergence, Effort, Optimizer
-from pathspace_graph.batch.system import Evaluation
+from pathspace_graph.batch.system import Convergence, Effort, Evaluation, Optimizer
 from pathspace_graph.cli import main
 from pathspace_graph.errors import SolveError
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
@@ -201,7 +200,7 @@ def test_a_run_that_did_not_converge_is_written_and_reported(
 ) -> None:
     write_log(broken_off(bean(), 0.3), tmp_path / "log")
     arguments = ["batch", str(tmp_path / "log"), "--out", str(tmp_path / "map"), "--start", "odometry"]
-    monkeypatch.setattr("pathspace_graph.batch.optimizer.Effort", lambda: Effort(rounds=1))
+    monkeypatch.setattr("pathspace_graph.batch.system.Effort", lambda: Effort(rounds=1))
     assert main(arguments) == 3
     summary = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert not summary["convergence"]["converged"]

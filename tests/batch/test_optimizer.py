@@ -9,16 +9,17 @@ import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.association import associate
-from pathspace_graph.batch.optimizer import (
+from pathspace_graph.batch.system import (
     GATE_FACTOR,
     LOOSE_GATE,
     TOLERANCE_DECREASE,
+    BatchSystem,
+    Evaluation,
     Optimizer,
     Stage,
     extrapolation_factor,
     predicted_decrease,
 )
-from pathspace_graph.batch.system import BatchSystem, Evaluation
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.graph.elimination import Damping, solution
 from pathspace_graph.mapping.state import State

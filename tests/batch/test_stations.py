@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.association import cone_stations, laps_of_detections
 from pathspace_graph.batch.lap import OpenLap, along_of, lap_optimum, marginal_of, stations_on
 from pathspace_graph.batch.mapper import BatchMapper
-from pathspace_graph.batch.optimizer import predicted_decrease
 from pathspace_graph.batch.simplification import map_block, simplified
-from pathspace_graph.batch.system import BatchSystem, Evaluation, moved, nonlinear_graph
+from pathspace_graph.batch.system import BatchSystem, Evaluation, moved, nonlinear_graph, predicted_decrease
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.io.log import Log
 from pathspace_graph.mapping.detections import NO_STATION

@@ -13,7 +13,7 @@ from scipy.interpolate import BSpline as ScipyBSpline
 
 from pathspace_graph import __main__ as program
 from pathspace_graph.baselines.landmark_graph import LandmarkFixedLag
-from pathspace_graph.batch import optimizer
+from pathspace_graph.batch import system
 from pathspace_graph.cli import COMMANDS, main
 from pathspace_graph.commands import estimate as commands_estimate
 from pathspace_graph.io.log import Odometry
@@ -173,7 +173,7 @@ def test_an_estimate_that_cannot_be_computed_is_one_line_and_exit_code_3(
         raise np.linalg.LinAlgError("SVD did not\nconverge")
 
     monkeypatch.setattr(LandmarkFixedLag, "update", fails)
-    monkeypatch.setattr(optimizer, "solution", fails)
+    monkeypatch.setattr(system, "solution", fails)
     command = "batch" if estimator == "spline" else "online"
     options = (
         ["--estimator", estimator, "--start", "odometry"]

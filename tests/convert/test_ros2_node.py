@@ -17,7 +17,7 @@ from pathspace_graph.io.files import write_json
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import map_to_json, read_map
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.seeking import Seeking
+from pathspace_graph.loop.open import Seeking
 from pathspace_graph.ros import node as ros
 from pathspace_graph.ros.node import MessageStream
 from pathspace_graph.sim.simulate import SimulationSettings, simulate

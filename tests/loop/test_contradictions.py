@@ -13,8 +13,7 @@ from scipy.spatial import KDTree
 from pathspace_graph.factors.se2 import to_vehicle
 from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.known_loop import Loop, is_mapped
-from pathspace_graph.loop.map_repair import CERTAIN, SETTLE, SIGHTINGS, MapRepair
+from pathspace_graph.loop.known_loop import CERTAIN, SETTLE, SIGHTINGS, Loop, MapRepair, is_mapped
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.settings.mapper import MapperSettings
 

@@ -19,9 +19,8 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import NO_COVARIANCE, Map, SplineBoundary
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.loop.closed import Closed
-from pathspace_graph.loop.map_repair import REPAIRED
-from pathspace_graph.loop.open import Open
-from pathspace_graph.loop.seeking import PLACED, SEEKING, OnOpenMap
+from pathspace_graph.loop.known_loop import REPAIRED
+from pathspace_graph.loop.open import PLACED, SEEKING, OnOpenMap, Open
 from pathspace_graph.online.fixed_lag import FixedLagMapper, _Before
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.sim.simulate import SimulationSettings, simulate

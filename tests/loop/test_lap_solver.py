@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from pathspace_graph.batch.lap import LapMarginal
-from pathspace_graph.batch.optimizer import Convergence
-from pathspace_graph.loop import worker
+from pathspace_graph.batch.system import Convergence
+from pathspace_graph.loop import lap_solver
 from pathspace_graph.loop.drive import Drive
 from pathspace_graph.loop.lap_solver import LapSolver
 from pathspace_graph.mapping.road import Road
@@ -41,7 +41,7 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[Lap]:
         laps.append(Lap())
         return laps[-1]
 
-    monkeypatch.setattr(worker, "submit", submit)
+    monkeypatch.setattr(lap_solver, "submit", submit)
     return laps
 
 
@@ -104,7 +104,7 @@ def test_a_batch_that_is_late_when_the_drive_ends_is_recorded_past_its_last_cycl
     begin(again, 270, 300)
     sent[-1].set_result(solved(1.0))
     assert outcome(again, 350, 270) is None
-    assert outcome(again, 351, 270) == worker.BATCH_LATE
+    assert outcome(again, 351, 270) == lap_solver.BATCH_LATE
 
 
 def test_the_wait_of_a_cycle_ends_with_its_period(sent: list[Lap]) -> None:

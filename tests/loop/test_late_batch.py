@@ -24,9 +24,9 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.se2 import path_lengths, relative, wrap_angle
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT
-from pathspace_graph.loop import worker
+from pathspace_graph.loop import lap_solver
+from pathspace_graph.loop.known_loop import REPAIRED
 from pathspace_graph.loop.lap_solver import LONGEST_WAIT
-from pathspace_graph.loop.map_repair import REPAIRED
 from pathspace_graph.loop.open import RETRY, STAYS_OPEN, ReturnFinder, Revisits
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
@@ -72,7 +72,7 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[Slow]:
         batches.append(Slow(*arguments))
         return batches[-1]
 
-    monkeypatch.setattr(worker, "submit", submit)
+    monkeypatch.setattr(lap_solver, "submit", submit)
     return batches
 
 
@@ -203,7 +203,7 @@ def test_a_slow_machine_changes_nothing_of_a_replay(monkeypatch: pytest.MonkeyPa
         return future
 
     expected, mapper = mapped(log())[0], with_settings()
-    monkeypatch.setattr(worker, "submit", submit)
+    monkeypatch.setattr(lap_solver, "submit", submit)
     result = run_online(log(), mapper)
     assert_same(mapper, expected)
     assert result.waited > 0.0
@@ -217,7 +217,7 @@ def test_a_batch_that_never_ends_is_given_up_and_the_window_is_the_lag_again(
     sent: list[Slow], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ended: list[bool] = []
-    monkeypatch.setattr(worker, "_end_worker", lambda: ended.append(True))
+    monkeypatch.setattr(lap_solver, "_end_worker", lambda: ended.append(True))
     monkeypatch.setattr("pathspace_graph.loop.lap_solver.MOST_LATE", 12)
     monkeypatch.setattr("pathspace_graph.loop.open.RETRY", 1e3)  # the next one would be sent at once
     mapper = with_settings()
@@ -245,21 +245,21 @@ def test_a_late_batch_makes_the_window_no_longer_than_the_longest(sent: list[Slo
 
 
 def test_a_process_that_was_given_up_does_not_block_the_next_batch() -> None:
-    stuck = worker.submit(time.sleep, 600.0)
+    stuck = lap_solver.submit(time.sleep, 600.0)
     while not stuck.running():
         time.sleep(0.01)
-    batch = object.__new__(worker.LapBatch)
+    batch = object.__new__(lap_solver.LapBatch)
     batch._future = stuck
     batch.give_up()
-    assert worker.submit(sum, [1, 2]).result(120.0) == 3
+    assert lap_solver.submit(sum, [1, 2]).result(120.0) == 3
 
 
 USES_A_WORKER = """
 from multiprocessing import get_context
-from pathspace_graph.loop import worker
+from pathspace_graph.loop import lap_solver
 
 def use():
-    assert worker.submit(sum, [1, 2]).result(120.0) == 3
+    assert lap_solver.submit(sum, [1, 2]).result(120.0) == 3
 
 if __name__ == "__main__":
     process = get_context("spawn").Process(target=use)
@@ -286,9 +286,9 @@ def test_the_process_starts_with_the_mapper_and_cycles_submit_laps_only(
         submitted.append(work)
         return Future()
 
-    monkeypatch.setattr(worker, "submit", submit)
+    monkeypatch.setattr(lap_solver, "submit", submit)
     FixedLagMapper()
-    assert submitted == [worker.nothing]
+    assert submitted == [lap_solver.nothing]
     mapper = stem.mapper()
     for odometry, cycle in stem.rest(log()):
         mapper.update(odometry, cycle)
@@ -299,9 +299,9 @@ def test_the_process_starts_with_the_mapper_and_cycles_submit_laps_only(
 
 def test_an_interrupt_does_not_reach_the_process_of_the_batch_and_reaches_this_one() -> None:
     """Ctrl-C goes to all processes of a terminal; one that is still importing would print where it was."""
-    if worker._worker.cache_info().currsize:
-        worker._end_worker()
-    blocked = worker.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result(120.0)
+    if lap_solver._worker.cache_info().currsize:
+        lap_solver._end_worker()
+    blocked = lap_solver.submit(signal.pthread_sigmask, signal.SIG_BLOCK, ()).result(120.0)
     assert signal.SIGINT in blocked
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
@@ -326,9 +326,9 @@ def test_where_no_process_can_be_begun_there_is_a_notice(stem: Stem, monkeypatch
 
         def shutdown(self, **_: Any) -> None: ...
 
-    worker._worker.cache_clear()
+    lap_solver._worker.cache_clear()
     monkeypatch.setattr(loky, "ProcessPoolExecutor", lambda **_: Executor())
-    monkeypatch.setattr(worker, "submit", IN_A_PROCESS)
+    monkeypatch.setattr(lap_solver, "submit", IN_A_PROCESS)
     mapper = stem.mapper()
     results = [replay(mapper, *cycle) for cycle in stem.rest(log())]
     failed = f"{STAYS_OPEN}: the batch of the lap has failed: OSError: out of memory"
@@ -337,9 +337,9 @@ def test_where_no_process_can_be_begun_there_is_a_notice(stem: Stem, monkeypatch
 
 KILLED = """
 import os, signal
-from pathspace_graph.loop import worker
+from pathspace_graph.loop import lap_solver
 
-print(worker.submit(os.getpid).result(), flush=True)
+print(lap_solver.submit(os.getpid).result(), flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """
 

@@ -15,10 +15,10 @@ from pathspace_graph.eval.metrics.accuracy import lap_metrics
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop import map_repair
+from pathspace_graph.loop import known_loop
 from pathspace_graph.loop.closed import Closed
 from pathspace_graph.loop.drive import Drive, Step
-from pathspace_graph.loop.map_repair import REPAIRED, ContradictedStretch, carried, newest_lap, refitted
+from pathspace_graph.loop.known_loop import REPAIRED, ContradictedStretch, carried, newest_lap, refitted
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online
@@ -134,7 +134,7 @@ def test_a_map_that_does_not_explain_the_contradictions_or_is_worse_is_refused(
         return take(phase, road, drive, outcome)
 
     if why == "it explains too few":
-        monkeypatch.setattr(map_repair, "EXPLAINED", 2.0)
+        monkeypatch.setattr(known_loop, "EXPLAINED", 2.0)
     else:
         monkeypatch.setattr(Closed, "take", take_worse)
     mapper, results = map_log(holed(), *map_beginning(holed(), LAP))

@@ -21,8 +21,8 @@ from pathspace_graph.graph.variables import Layout, pose_keys
 from pathspace_graph.health import DEGRADED, GOOD, LOST
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
+from pathspace_graph.loop.closed import FOUND, LEAST_PATH, WIDENING, Search, restart_window
 from pathspace_graph.loop.known_loop import KnownLoop, evidence_of
-from pathspace_graph.loop.lost import FOUND, LEAST_PATH, WIDENING, Search, restart_window
 from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.places.find import STRETCH, KnownRoad, Place

@@ -24,7 +24,7 @@ from pathspace_graph.graph.gaussian import normal_equations
 from pathspace_graph.graph.variables import CALIBRATION_KEY, Layout, Variables, pose_keys
 from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import drive as drives
-from pathspace_graph.loop import worker
+from pathspace_graph.loop import lap_solver
 from pathspace_graph.loop.drive import DriveRecord
 from pathspace_graph.loop.open import STAYS_OPEN
 from pathspace_graph.mapping.road import HELD, Road
@@ -94,7 +94,7 @@ def test_the_map_is_within_the_noise() -> None:
 
 def test_the_same_log_gives_the_same_map_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """The lap is solved by a process of its own this time, as in a vehicle."""
-    monkeypatch.setattr(worker, "submit", laps.IN_A_PROCESS)
+    monkeypatch.setattr(lap_solver, "submit", laps.IN_A_PROCESS)
     again, mapper = map_log(log())[0], run()[0]
     for label in mapper.boundaries:
         assert (again.control_points(label) == mapper.control_points(label)).all()
@@ -237,8 +237,8 @@ def test_a_lap_without_a_batch_stays_open_and_says_why(
 
 def test_a_batch_that_does_not_converge_closes_nothing_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its optimum is farther away than nothing at all, so it is never near enough."""
-    monkeypatch.setattr(worker, "SOLVED", 0.0)
-    monkeypatch.setattr(worker, "submit", _unconverged)
+    monkeypatch.setattr(lap_solver, "SOLVED", 0.0)
+    monkeypatch.setattr(lap_solver, "submit", _unconverged)
     mapper, results = map_log(log(), *open_lap())
     notices = {result.notice for result in results if result.notice}
     assert notices == {"the loop stays open: the batch of the lap has not converged"}
@@ -248,7 +248,7 @@ def test_a_batch_that_does_not_converge_closes_nothing_and_says_so(monkeypatch: 
 def test_where_the_process_dies_the_next_batch_closes_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     mapper, results = open_lap()
     rest, died = islice(split_odometry(log()), len(results), None), ""
-    monkeypatch.setattr(worker, "solve_lap", _exit)
+    monkeypatch.setattr(lap_solver, "solve_lap", _exit)
     for cycle in rest:
         result = replay(mapper, *cycle)
         if result.notice:

@@ -12,7 +12,7 @@ from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.io.log import Detections
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.labels import BIG_ORANGE, ORANGE
-from pathspace_graph.mapping.orange import OrangeDetections, orange_cones
+from pathspace_graph.mapping.tracks import OrangeDetections, orange_cones
 from pathspace_graph.settings.mapper import GrowthSettings
 
 Array = NDArray[np.float64]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from pathspace_graph.batch.system import weak_priors
 from pathspace_graph.front_end.log_odometry import half_square
 from pathspace_graph.graph.variables import pose_keys
-from pathspace_graph.mapping.gtsam_graph import factor_beside
+from pathspace_graph.mapping.curve_map import factor_beside
+from pathspace_graph.mapping.detection_rows import WeakPriors
 from pathspace_graph.mapping.state import State
-from pathspace_graph.mapping.weak_priors import WeakPriors
 from pathspace_graph.settings.mapper import GaugeSettings
 from pathspace_graph.spline.boundary import Boundary
 

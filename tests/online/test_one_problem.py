@@ -7,8 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.optimizer import Optimizer
-from pathspace_graph.batch.system import BatchSystem, Evaluation
+from pathspace_graph.batch.system import BatchSystem, Evaluation, Optimizer
 from pathspace_graph.graph.gaussian import normal_equations
 from pathspace_graph.loop.open import open_map
 from pathspace_graph.online.fixed_lag import FixedLagMapper

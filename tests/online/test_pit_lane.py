@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.health import LOST
-from pathspace_graph.loop.lost import FOUND
+from pathspace_graph.loop.closed import FOUND
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings

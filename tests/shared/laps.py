@@ -1,4 +1,4 @@
-"""Laps that online mappers close: each is solved once a session, by the process of one worker."""
+"""Laps that online mappers close: each is solved once a session, by the process of one lap_solver."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 from joblib.externals import loky
 
 from pathspace_graph.batch.lap import LapMarginal, OpenLap, solve_lap
-from pathspace_graph.loop import worker
+from pathspace_graph.loop import lap_solver
 
 from .session import once
 
-IN_A_PROCESS = worker.submit
+IN_A_PROCESS = lap_solver.submit
 """What an online mapper calls where no test is run."""
 
 
@@ -25,9 +25,9 @@ def solved(lap: OpenLap) -> LapMarginal:
 
 
 def submit(work: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """In place of `worker.submit`: a lap that was solved before is not handed to the process again."""
+    """In place of `lap_solver.submit`: a lap that was solved before is not handed to the process again."""
     future: Future[Any] = loky.Future()
-    if work is worker.nothing:
+    if work is lap_solver.nothing:
         future.set_result(None)
     elif work is solve_lap:
         try:

@@ -19,7 +19,7 @@ from pathspace_graph.batch.joint import (
     solve_together,
 )
 from pathspace_graph.batch.mapper import BatchMapper, BatchResult
-from pathspace_graph.batch.optimizer import Optimizer
+from pathspace_graph.batch.system import Optimizer
 from pathspace_graph.batch.system import moved as stepped
 from pathspace_graph.errors import SettingsError, SolveError
 from pathspace_graph.eval.metrics.accuracy import lap_metrics
