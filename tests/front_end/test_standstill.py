@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_fixed_lag import LandmarkFixedLag
+from pathspace_graph.baselines.landmark_graph import LandmarkFixedLag
 from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import half_square, mean_bias

@@ -131,7 +131,7 @@ def scaled(points: np.ndarray) -> np.ndarray:
         (SensorFaults(lateral=0.2), lambda points: points - [0.0, 0.2], 1e-6),
         (SensorFaults(range_scale=0.02, range_bias=0.4), scaled, 1e-6),
     ],
-    ids=repr,
+    ids=["late", "early", "turned", "aside", "ranges"],
 )
 def test_a_constant_error_moves_each_detection_by_its_size(
     fault: SensorFaults, expected: Callable[[np.ndarray], np.ndarray], atol: float, clean_straight: Log
