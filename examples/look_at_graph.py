@@ -38,12 +38,9 @@ def kind(factor: gtsam.NonlinearFactor) -> str:
     """Name the kind of a factor of the mapper, by its class and its keys."""
     letters = {gtsam.symbolChr(key) for key in list(factor.keys())}
     if isinstance(factor, gtsam.CustomFactor):
-        return "odometry" if CALIBRATION in letters else "spline projection"
-    if isinstance(factor, gtsam.RangeFactor2):
-        return "spacing"
-    if isinstance(factor, gtsam.LinearContainerFactor):
-        return "prior of the window" if letters & {POSE, CALIBRATION, SENSOR} else "smoothness"
-    return "anchor"
+        seen = "place of a control point" if factor.size() == 2 else "spline projection"
+        return "odometry" if CALIBRATION in letters else seen
+    return "prior of the window" if letters & {POSE, CALIBRATION, SENSOR} else "smoothness"
 
 
 def errors_by_kind(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> dict[str, tuple[int, float]]:

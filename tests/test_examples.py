@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-import gtsam
 import pytest
 
 from .scenes.paths import ROOT
@@ -64,16 +63,10 @@ def test_a_boundary_passes_through_the_surveyed_point() -> None:
 
 def test_the_graph_can_be_looked_at(tmp_path: Path) -> None:
     errors = example("look_at_graph").main(tmp_path, cycles=100)
-    kinds = {"spline projection", "spacing", "smoothness", "anchor", "odometry", "prior of the window"}
+    kinds = {"spline projection", "place of a control point", "smoothness", "odometry", "prior of the window"}
     assert set(errors) == kinds
     assert all(count > 0 and error >= 0.0 for count, error in errors.values())
     assert (tmp_path / "graph.png").stat().st_size > 0
-
-
-def test_kinds_are_told_by_class_and_keys() -> None:
-    noise = gtsam.noiseModel.Isotropic.Sigma(2, 1.0)
-    prior = gtsam.PriorFactorPoint2(gtsam.symbol("l", 0), gtsam.Point2(0.0, 0.0), noise)
-    assert example("look_at_graph").kind(prior) == "anchor"
 
 
 @pytest.mark.parametrize("name", ["gnss", "surveyed_point", "look_at_graph"])

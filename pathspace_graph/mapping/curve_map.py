@@ -151,7 +151,7 @@ class CurveMap:
     def place(self, label: int, first: int) -> None:
         """Keep the control points from index `first` on where they are, as seen from the newest pose.
 
-        These weak priors replace any that they have had.
+        These weak priors replace those that they have in the window.
         """
         points = np.arange(first, self.state.boundaries[label].size)
         if len(points) == 0:

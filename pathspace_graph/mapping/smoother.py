@@ -220,6 +220,9 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
             return boundary.everything
         first, last = boundary.tables.span_of(low), boundary.tables.span_of(high)
         if not boundary.periodic:
+            weak = self.map.weak.get(label)  # an end that was carried on may lie farther behind
+            if weak is not None and len(weak.keys):
+                first = min(first, int(weak.triples.min() - self.map.state.control_keys(label)[0]))
             return np.arange(first, boundary.size)
         last += boundary.degree + (boundary.size if last < first else 0)
         if last - first >= boundary.size - 1:

@@ -123,7 +123,7 @@ class ClosingSettings(Checked):
 
     min_path: ClassVar[float] = 60.0  # least length of a lap, m
     check_interval: ClassVar[float] = 2.0  # m along the path, from one attempt to close the loop to the next
-    radius: ClassVar[float] = 8.0  # m from the first stretch of the drive, within which the loop may close
+    radius: ClassVar[float] = 8.0  # m from the first stretch of a drive, where lines and landmarks close it
     drift: ClassVar[float] = 0.03  # growth of `radius` with the path driven (m/m)
     iterations: ClassVar[int] = 2  # Gauss-Newton steps after the loop is found, and after simplification
 

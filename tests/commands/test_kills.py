@@ -127,9 +127,9 @@ def test_a_study_that_is_killed_at_any_step_goes_on_with_whole_files(
     monkeypatch.setattr("pathspace_graph.eval.figures.drawing.SUFFIXES", (".png",))
     study, rows = "pathspace_graph.eval.experiment", [{"lap": 1, "rmse": 0.5}, {"lap": None}]
     monkeypatch.setattr(f"{study}.study.StudyDrive.load", lambda _: (recorded.log, ()))
-    monkeypatch.setattr(f"{study}.run.measure", lambda *_, **__: rows)
-    monkeypatch.setattr(f"{study}.run.stage_times", lambda _: [])
-    monkeypatch.setattr(f"{study}.run.summarize", lambda *_, **__: {})
+    monkeypatch.setattr("pathspace_graph.eval.metrics.measures.measure", lambda *_, **__: rows)
+    monkeypatch.setattr("pathspace_graph.eval.metrics.measures.stage_times", lambda _: [])
+    monkeypatch.setattr("pathspace_graph.eval.metrics.measures.summarize", lambda *_, **__: {})
     monkeypatch.setattr(f"{study}.run.origin_of", lambda _: versions() | {"date": "then"})
     monkeypatch.setattr(f"{study}.tables.plot_differences", lambda *_: Figure())
     track = write_round_track(tmp_path)

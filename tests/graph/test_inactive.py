@@ -202,7 +202,7 @@ class Checked(CurveSmoother):
         if len(self.inactive) == 0 or self.chain is not None:
             return
         assert sigma_step is not None
-        kept = jacobian_factors(rows_in(*self.window.stores), self.variables.layout)
+        kept = jacobian_factors(rows_in(self.window.measured), self.variables.layout)
         graph = graph_of(self.prior, self.inactive.net, *kept.values())
         whole = Layout(keys_of(graph))
         hessian, vector = normal_equations(graph, whole)

@@ -89,7 +89,9 @@ def variance_of_residual(mapper: FixedLagMapper) -> float:
 def test_the_gate_is_three_sigmas_of_detection_pose_and_curve_together() -> None:
     """The odometry of the cycle is so poor that the detection's own uncertainty is half of the variance."""
     mapper = driven()
-    mapper.front_end.noise.known.odometry[:] = [0.25, 6.0, 0.035]
+    noise = mapper.front_end.noise
+    noise.known.odometry[:] = [0.25, 6.0, 0.035]
+    mapper.front_end._motion.set_noise(noise.twist)
     variance = variance_of_residual(mapper)
     assert variance > 1.8 * OWN_VARIANCE
     shares = [-1.5, -1.03, -0.97, -0.3, 0.0, 0.5, 0.97, 1.03, 1.5]

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.factors.noise import KnownNoise, MeasuredNoise, RayNoise
 from pathspace_graph.factors.odometry import MIN_SIGMA, integrate_twists
-from pathspace_graph.factors.se2 import wrap_angle
+from pathspace_graph.factors.se2 import compose, wrap_angle
 from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.graph.rows import Revisit
 from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.io.log import Detections, Odometry
-from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.drive import DriveRecord
+from pathspace_graph.labels import LEFT, ORANGE, RIGHT
+from pathspace_graph.loop import drive as drives
+from pathspace_graph.loop.drive import Drive, DriveRecord
 from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry, known_noise
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.settings.mapper import MapperSettings, OdometrySettings
@@ -86,6 +90,31 @@ def test_the_heading_of_replaced_poses_does_not_jump() -> None:
     record.replaced(wrapped)
     for poses in (record.poses, record.corrected):
         np.testing.assert_allclose(np.diff(poses[:, 2]), SPEED * CYCLE / RADIUS, atol=1e-9)
+
+
+def test_the_newest_path_keeps_the_shape_in_which_it_was_driven() -> None:
+    """Updates turn the window by a little each, and so do the recorded poses from cycle to cycle."""
+    straight, record = np.arange(20.0)[:, None] * [1.0, 0.0, 0.0], DriveRecord()
+    turns = np.arange(20.0)[:, None] * [0.0, 0.1, 0.01]
+    for k in range(20):
+        window = compose(turns[k], straight[max(k - 1, 0) : k + 1])
+        road: Any = SimpleNamespace(closed=False, poses=window, smoother=SimpleNamespace(first_cycle=18))
+        record.estimated(road)
+    found = record.with_newest_path(road, 10.0)
+    np.testing.assert_allclose(found[10:], compose(turns[-1], straight[10:]))
+    np.testing.assert_allclose(found[:10], compose(turns[:10], straight[:10]))
+
+
+def test_orange_cones_go_with_the_poses_of_another_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    road, drive = Road(MapperSettings()), Drive(MapperSettings())
+    road.smoother.variables.insert(pose_keys(np.arange(1)), np.zeros(3))
+    cone = Detections(0.1, np.array([[6.0, 2.0]]), 0.01 * np.eye(2)[None], np.array([ORANGE]))
+    road.orange.add(cone, 1, np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    monkeypatch.setattr(drives, "take_marginal", lambda *_: np.zeros(3))
+    poses = np.array([[0.0, 0.0, 0.0], [1.0, 0.2, 0.3], [2.0, 0.4, 0.3]])
+    solved: Any = SimpleNamespace(closed=False, seconds=0.1, poses=poses, first_kept=2)
+    drive.take(road, solved)
+    np.testing.assert_array_equal(road.orange.pose, poses[1:2])
 
 
 # --- noise -----------------------------------------------------------------------------------------------

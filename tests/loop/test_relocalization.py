@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from itertools import islice
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +20,10 @@ from pathspace_graph.front_end.front_end import FrontEnd, Reading
 from pathspace_graph.graph.gaussian import factorize, marginalize
 from pathspace_graph.graph.smoother import forget_poses
 from pathspace_graph.graph.variables import Layout, pose_keys
-from pathspace_graph.health import DEGRADED, GOOD, LOST
+from pathspace_graph.health import DEGRADED, GOOD, LOST, Evidence, Health
 from pathspace_graph.io.log import Log, Odometry
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.loop.closed import FOUND, LEAST_PATH, WIDENING, Search, restart_window
+from pathspace_graph.loop.closed import FOUND, LEAST_PATH, WIDENING, Lost, Search, restart_window
 from pathspace_graph.loop.known_loop import KnownLoop, evidence_of
 from pathspace_graph.mapping.smoother import Gating
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -215,6 +217,22 @@ def test_the_prior_of_a_place_that_was_found_has_three_times_its_sigmas() -> Non
     smoother.map.detections.release(np.arange(len(smoother.map.detections)))
     newest = pose_keys(np.array([smoother.next_cycle - 1]))
     np.testing.assert_allclose(smoother.covariance(newest), WIDENING**2 * covariance, atol=1e-6)
+
+
+def test_what_has_shown_that_a_vehicle_is_lost_says_nothing_once_it_is_found() -> None:
+    mapper = copied(clean()[1])
+    road, drive, t = mapper.road, mapper.drive, mapper.road.smoother.times[-1]
+    wrong = Evidence(t, offered=20, closed=True, sigma=0.1)
+    right = Evidence(t + 0.1, offered=10, explained=10, used=10, closed=True, sigma=0.1)
+    drive.monitor.restart()
+    lost = Lost(mapper.phase, road, drive.monitor.update(wrong))
+    search: Any = SimpleNamespace(find=lambda: Place(road.poses[-1], np.eye(3), 9.0), first_cycle=0)
+    lost.search = search
+    nothing = reading_of(np.zeros(0, bool))
+    assert drive.copy().monitor.update(right).condition == LOST
+    step = lost.step(road, drive, nothing, 0.0)
+    assert step.phase is mapper.phase and step.notice == FOUND
+    assert drive.monitor.update(right) == Health(GOOD)
 
 
 def test_the_remembered_path_has_a_bound() -> None:

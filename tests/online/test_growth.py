@@ -307,7 +307,8 @@ def backwards(mapper: FixedLagMapper, log: Log) -> float:
     cones = log.truth.cones[log.truth.cone_labels == LEFT]
     spline = mapper.boundaries[LEFT].spline(mapper.control_points(LEFT))
     u = np.linspace(*spline.domain, 4000)
-    nearest = u[KDTree(spline.evaluate(u)).query(cones)[1]]
+    distance, nearest = KDTree(spline.evaluate(u)).query(cones)
+    nearest = u[nearest[distance < 1.0]]  # the others lie beyond an end
     return float(np.max(-np.diff(nearest), initial=0.0))
 
 
