@@ -18,12 +18,7 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import compose, inverse, move_points, path_lengths
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.rows import Revisit
-from pathspace_graph.graph.variables import (
-    CALIBRATION_KEY,
-    SENSOR_KEY,
-    Drives,
-    pose_keys,
-)
+from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Drives, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import PointBoundary
 from pathspace_graph.lengths import scaled

@@ -27,13 +27,7 @@ from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.growth import GROWTH_REACH
 from pathspace_graph.mapping.path import MIN_LATERAL, SIDES, along_and_across
 from pathspace_graph.mapping.state import State
-from pathspace_graph.places.find import (
-    NEARBY,
-    find_return,
-    return_to_beginning,
-    revisit_of,
-    seen_in,
-)
+from pathspace_graph.places.find import NEARBY, find_return, return_to_beginning, revisit_of, seen_in
 from pathspace_graph.run import OnlineEstimator, run_online
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary

@@ -15,13 +15,7 @@ import numpy as np
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.noise import (
-    SURE,
-    MeasuredNoise,
-    RayNoise,
-    huber_weights,
-    ray_axes,
-)
+from pathspace_graph.factors.noise import SURE, MeasuredNoise, RayNoise, huber_weights, ray_axes
 from pathspace_graph.factors.se2 import compose, in_vehicle, left_of, rotated, rotations, se2_exp, to_map
 from pathspace_graph.factors.sensor import BENDS_FROM, SENSOR_SIZE
 from pathspace_graph.io.log import Detections, Odometry

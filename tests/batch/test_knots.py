@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.simplification import (
-    MIN_SIZE_SHARE,
-    boundary_of,
-    fit_through,
-    reknot,
-)
+from pathspace_graph.batch.simplification import MIN_SIZE_SHARE, boundary_of, fit_through, reknot
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.batch import ring, straight

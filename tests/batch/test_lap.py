@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import (
-    LapMarginal,
-    OpenLap,
-    lap_optimum,
-    marginal_of,
-    solve_lap,
-)
+from pathspace_graph.batch.lap import LapMarginal, OpenLap, lap_optimum, marginal_of, solve_lap
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.start import StartMap
 from pathspace_graph.batch.system import BatchSystem, Effort, Evaluation, weak_priors

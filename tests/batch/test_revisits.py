@@ -13,12 +13,7 @@ from numpy.typing import NDArray
 
 from pathspace_graph.batch.lap import BENT_SIGMAS, disagreement
 from pathspace_graph.batch.simplification import own_settings
-from pathspace_graph.batch.start import (
-    REVISIT_INTERVAL,
-    aligned_odometry,
-    find_revisits,
-    length_of_lap,
-)
+from pathspace_graph.batch.start import REVISIT_INTERVAL, aligned_odometry, find_revisits, length_of_lap
 from pathspace_graph.factors.se2 import path_lengths, relative, wrap_angle
 from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry

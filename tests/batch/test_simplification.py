@@ -6,13 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.association import cones_of_curve, points_along
-from pathspace_graph.batch.simplification import (
-    Scatter,
-    cross_validated,
-    fit_line,
-    reknot,
-    simplified,
-)
+from pathspace_graph.batch.simplification import Scatter, cross_validated, fit_line, reknot, simplified
 from pathspace_graph.labels import LEFT
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.state import State

@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.convert.messages import Points
-from pathspace_graph.convert.recording import (
-    Recording,
-    to_log,
-    windowed,
-)
+from pathspace_graph.convert.recording import Recording, to_log, windowed
 from pathspace_graph.convert.settings import Frames, NoiseSettings, Side, Window
 from pathspace_graph.errors import InputError
 from pathspace_graph.io.log import ray_covariances

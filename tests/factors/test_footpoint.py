@@ -9,12 +9,7 @@ from hypothesis import strategies as st
 
 from pathspace_graph.factors._kernels import Curves
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.bspline import (
-    SpanPolynomials,
-    clamped_knots,
-    periodic_knots,
-    uniform_knots,
-)
+from pathspace_graph.factors.bspline import SpanPolynomials, clamped_knots, periodic_knots, uniform_knots
 from pathspace_graph.factors.footpoint import FootPoints, foot_points
 
 GRID = 400

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from pathspace_graph.factors.bspline import SpanPolynomials, uniform_knots
-from pathspace_graph.factors.residuals import (
-    greville,
-    smoothness_coefficients,
-    smoothness_matrix,
-)
+from pathspace_graph.factors.residuals import greville, smoothness_coefficients, smoothness_matrix
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.jacobians import assert_jacobians

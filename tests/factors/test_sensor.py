@@ -11,12 +11,7 @@ from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import MeasuredNoise
 from pathspace_graph.factors.se2 import compose, in_vehicle, inverse, rotation, se2_exp, to_map
-from pathspace_graph.factors.sensor import (
-    SENSOR,
-    by_bend,
-    by_sensor,
-    restored,
-)
+from pathspace_graph.factors.sensor import SENSOR, by_bend, by_sensor, restored
 
 TWIST = np.array([[10.0, 0.5, 0.4]])
 """The vehicle moves with this twist (m/s, m/s, rad/s)."""

@@ -11,14 +11,7 @@ from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import rotation
 from pathspace_graph.graph.gaussian import graph_of, normal_equations
 from pathspace_graph.graph.inactive import RelativeFactor
-from pathspace_graph.graph.variables import (
-    CALIBRATION_KEY,
-    POSE,
-    Layout,
-    Variables,
-    control_keys,
-    pose_key,
-)
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, Variables, control_keys, pose_key
 
 NOTHING = np.zeros(0, np.intp)
 KEYFRAME, END = pose_key(2), pose_key(6)

@@ -17,15 +17,7 @@ from pathspace_graph.online.outlook import SIGMA_BEND, Outlook, joint_covariance
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 
-from ..scenes.drives import (
-    ahead,
-    corridor,
-    detections,
-    exact_lap,
-    exact_log,
-    map_log,
-    mapped,
-)
+from ..scenes.drives import ahead, corridor, detections, exact_lap, exact_log, map_log, mapped
 
 Array = NDArray[np.float64]
 

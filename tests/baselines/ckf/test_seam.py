@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.filters import (
-    Overlap,
-    curvature_weighted_breaks,
-    find_overlap,
-    make_periodic,
-)
+from pathspace_graph.baselines.filters import Overlap, curvature_weighted_breaks, find_overlap, make_periodic
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import Boundary
 from pathspace_graph.spline.bspline import BSpline, fit_spline

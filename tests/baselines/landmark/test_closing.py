@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.baselines.landmark_graph import (
-    JointCompatibility,
-    detect_loop,
-)
+from pathspace_graph.baselines.landmark_graph import JointCompatibility, detect_loop
 from pathspace_graph.labels import LEFT, RIGHT
 
 from .scenes import with_covariance

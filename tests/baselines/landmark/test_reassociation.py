@@ -5,11 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pathspace_graph.baselines.landmark_graph import (
-    predicted_covariances,
-    reassociate,
-    remove_rare,
-)
+from pathspace_graph.baselines.landmark_graph import predicted_covariances, reassociate, remove_rare
 from pathspace_graph.baselines.landmarks import UNASSOCIATED, LandmarkState, LandmarkSystem
 from pathspace_graph.factors.residuals import landmark_residuals
 from pathspace_graph.graph.variables import pose_key
