@@ -49,7 +49,6 @@ from pathspace_graph.settings.mapper import GaugeSettings, MapperSettings
 LOOSE_GATE: Final = 8.0  # gate of the first round (sigmas)
 SETTLE_FEET: Final = 16  # largest number of refinements of the foot points before a step
 SETTLED_FOOT: Final = 1e-3  # largest move of a converged foot point (m along the curve)
-
 HELD_SPACING: Final = 0.05  # `gauge.sigma_spacing` of curves without stations
 
 OwnFactors = Sequence[gtsam.NonlinearFactor] | Callable[[State], Sequence[gtsam.NonlinearFactor]]
@@ -279,7 +278,7 @@ class BatchSystem:
         here, groups = state.variables, list[Rows]()
         for label, one in self.weak.items():
             root = np.tile(np.sqrt(weight) * np.eye(POINT), (len(one.keys), 1, 1))
-            rows = replace(one, whitener=root).rows(here)[0]
+            rows = replace(one, whitener=root).places(here)
             groups.append(replace(rows, residual=np.zeros(len(rows)), owner=owners(rows.owner, label)))
         return groups
 

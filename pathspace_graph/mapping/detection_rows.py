@@ -268,22 +268,23 @@ class WeakPriors:
         return type(self)(*map(np.concatenate, both))
 
     def rows(self, variables: Variables) -> list[Rows]:
-        """Linearize places on [pose | point], and second differences on [point | point | point]."""
-        if len(self.keys) == 0:
-            return []
+        return [self.places(variables), self.bends(variables)] if len(self.keys) else []
+
+    def places(self, variables: Variables) -> Rows:
+        """Linearize `W (R' (c - p) - z)` on [pose | point], two rows for each point."""
         poses, points = variables.poses_at(self.cycle), variables.of(self.keys).reshape(-1, POINT)
         seen, by_point = to_vehicle(points, poses), self.whitener @ rotations(poses[:, 2]).transpose(0, 2, 1)
         by_heading = -self.whitener @ left_of(seen)[:, :, None]
         by_both = np.concatenate([-by_point, by_heading, by_point], axis=2)
         off = self.whitener @ (seen - self.place)[:, :, None]
-        by_axis = np.zeros((len(points), POINT, 3, POINT))
+        keys = np.repeat(np.column_stack([pose_keys(self.cycle), self.keys]), POINT, axis=0)
+        return Rows(keys, by_both.reshape(len(keys), -1), off.ravel(), np.repeat(self.cycle, POINT))
+
+    def bends(self, variables: Variables) -> Rows:
+        """Linearize second differences on [point | point | point], a row for each coordinate."""
+        by_axis = np.zeros((len(self.keys), POINT, 3, POINT))
         by_axis[:, 0, :, 0] = by_axis[:, 1, :, 1] = self.bending
         three = variables.of(self.triples.ravel()).reshape(-1, 3, POINT)
         bent = (self.bending[:, :, None] * three).sum(axis=1)
-        beside, owner = np.column_stack([pose_keys(self.cycle), self.keys]), np.repeat(self.cycle, POINT)
-        return [
-            Rows(np.repeat(beside, POINT, axis=0), by_both.reshape(len(owner), -1), off.ravel(), owner),
-            Rows(
-                np.repeat(self.triples, POINT, axis=0), by_axis.reshape(len(owner), -1), bent.ravel(), owner
-            ),
-        ]
+        keys = np.repeat(self.triples, POINT, axis=0)
+        return Rows(keys, by_axis.reshape(len(keys), -1), bent.ravel(), np.repeat(self.cycle, POINT))

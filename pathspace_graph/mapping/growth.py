@@ -90,9 +90,8 @@ class Growth(Copyable):
         if kept == len(boundary.observed):
             return self._extend(track, label, path_ahead, path.END_BEHIND)
         self._take_back(smoother, label, kept)
-        from_u, first = boundary.confirmed_end, boundary.settled(boundary.size)
+        from_u = boundary.confirmed_end
         self._extend(track, label, path_ahead, RECALL)
-        track.place(label, first)
         _relocate_poses(track.state, label, from_u)
         return True
 
@@ -131,7 +130,9 @@ class Growth(Copyable):
         self.tentative.restore(boundary.observed[kept:], label, self.settings.sightings, smoother.times[-1])
         boundary.take_back(kept)
         self.taken_back += 1
-        smoother.remove_information(state.control_keys(label)[boundary.settled(boundary.size) :])
+        first = boundary.settled(boundary.size)
+        smoother.remove_information(state.control_keys(label)[first:])
+        smoother.map.place(label, first)
         rows = detections.used_on(label)
         detections.release(rows[detections.u[rows] > boundary.trusted])
 
@@ -192,13 +193,13 @@ def _extend_through(track: CurveMap, label: int, end: Array, points: Array) -> A
     """Extend a curve from its end (2,) through points (k, 2); return their parameters (k,)."""
     state = track.state
     boundary, known = state.boundaries[label], state.control_points(label)
-    first = boundary.settled(len(known), boundary.last_cone(boundary.confirmed_end))
     u = boundary.confirmed_end + path_lengths(np.concatenate([end[None], points]))[1:]
-    control_points = boundary.grow(known.copy(), u, points)
+    placement = boundary.extend(len(known), u, boundary.last_cone(boundary.confirmed_end))
+    control_points = placement.place(known, points)
     known[:] = control_points[: len(known)]
     if len(control_points) > len(known):
         state.extend(label, control_points[len(known) :])
-    track.place(label, first)
+    track.place(label, placement.kept)
     return np.asarray(u)
 
 
