@@ -244,18 +244,12 @@ class RowStore:
     Keys and owners that are given are ascending.
     """
 
-    def __init__(self, groups: Sequence[_Rows] = ()) -> None: ...
-    def __bool__(self) -> bool:
-        """Return whether there are any rows."""
-
+    def __init__(self) -> None: ...
     def copy(self) -> RowStore:
         """Return a store that can change independently."""
 
     def parts(self) -> list[_Parts]:
         """Return keys, derivatives, residuals and owners of the rows of each widths of variables."""
-
-    def owners(self) -> IntArray:
-        """Return the owners of all rows, which may occur several times."""
 
     def holding(self, keys: IntArray) -> IntArray:
         """Return the owners of rows that hold any of some keys (k,)."""
@@ -276,11 +270,11 @@ class RowStore:
         """Remove the rows of an owner; return places and block as `blocks_of` does."""
 
 def summed(
-    layout: _Layout, factors: list[tuple[IntArray, Array]], stores: Sequence[RowStore], change: Array
+    layout: _Layout, factors: list[tuple[IntArray, Array]], rows: RowStore, change: Array
 ) -> tuple[Array, Array]:
     """Return the lower triangle of H (n, n), by columns, and the negative gradient (n,), at `change` (n,).
 
-    They are sums over factors with `[[L, g], [g', f]]` and over all rows of stores, on variables of a layout.
+    They are sums over factors `[[L, g], [g', f]]` and all rows of a store, on variables of a layout.
     """
 
 # --- frames of poses -------------------------------------------------------------------------------------
@@ -474,12 +468,14 @@ def curve_rows(
     sensor: Array,
     limits: tuple[float, int, float, float],
     names: tuple[int, int],
-) -> tuple[IntArray, Array, bool, _Parts]:
+    stations: tuple[Array, Array, IntArray, Array] | None,
+) -> tuple[IntArray, Array, bool, list[_Parts]]:
     """Return detections by row, their refined parameters (m,), and the parts of `CurveMap.rows`.
 
     The third result says whether one has slid to where a curve is inactive. Curves have control points
     (n, 2), labels (k,), keys (n,), and parameters (k,) up to which and from which on they may be used. The
-    table has the columns of `DetectionTable.associated`.
+    table has the columns of `DetectionTable.associated`. Stations (s,), whose rows come second, have basis
+    functions and derivatives (s, p + 1), rows (s, p + 1) of the control points, and sigmas (s,).
     """
 
 def along_and_across(points: Array, path: Array, stations: Array) -> tuple[Array, Array]:

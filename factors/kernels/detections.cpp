@@ -137,26 +137,30 @@ py::tuple station_rows(const Array& points, const Array& covariances, const Arra
   return py::make_tuple(terms[0], sigma, jacobian);
 }
 
+// The rows of an array, chosen by index.
+template <typename T>
+T taken(const T& from, const std::vector<Index>& rows) {
+  Shape shape(from.shape(), from.shape() + from.ndim());
+  const Index all = shape[0], width = from.size() / std::max<Index>(all, 1);
+  shape[0] = Index(rows.size());
+  T out(shape);
+  for (Index i = 0; i < shape[0]; ++i) {
+    expect(rows[i] >= 0 && rows[i] < all);
+    std::copy_n(from.data() + width * rows[i], width, out.mutable_data() + width * i);
+  }
+  return out;
+}
+
 // Detections chosen by row, and the poses at which they were made.
 struct Seen {
-  Seen(const Ints& rows, const Ints& cycles, const Array& measured, const Array& twists, const Array& poses,
-       Index first_cycle, const Array& sensor)
-      : cycle(rows.shape(0)),
-        measured(Shape{rows.shape(0), 2}),
-        twist(Shape{rows.shape(0), 3}),
-        pose(Shape{rows.shape(0), 3}) {
-    const Index all = cycles.shape(0);
-    expect(measured.size() == 2 * all && twists.size() == 3 * all);
-    for (Index i = 0; i < rows.shape(0); ++i) {
-      const Index row = rows.data()[i];
-      expect(row >= 0 && row < all);
-      const Index slot = cycles.data()[row] - first_cycle;
-      expect(slot >= 0 && slot < poses.shape(0));
-      cycle.mutable_data()[i] = cycles.data()[row];
-      std::copy_n(measured.data() + 2 * row, 2, this->measured.mutable_data() + 2 * i);
-      std::copy_n(twists.data() + 3 * row, 3, twist.mutable_data() + 3 * i);
-      std::copy_n(poses.data() + 3 * slot, 3, pose.mutable_data() + 3 * i);
-    }
+  Seen(const std::vector<Index>& rows, const Ints& cycles, const Array& measured, const Array& twists,
+       const Array& poses, Index first_cycle, const Array& sensor)
+      : cycle(taken(cycles, rows)),
+        measured(taken(measured, rows)),
+        twist(taken(twists, rows)) {
+    std::vector<Index> slots(cycle.data(), cycle.data() + cycle.size());
+    for (Index& slot : slots) slot -= first_cycle;
+    pose = taken(poses, slots);
     points = to_map(sensor.size() ? shifted(this->measured, twist, sensor) : this->measured, pose);
   }
 
@@ -166,37 +170,50 @@ struct Seen {
 
 Array placed(const Ints& rows, const Ints& cycles, const Array& measured, const Array& twists,
              const Array& poses, Index first_cycle, const Array& sensor) {
-  return rows.size() ? Seen(rows, cycles, measured, twists, poses, first_cycle, sensor).points
-                     : Array(Shape{0, 2});
+  const std::vector<Index> chosen(rows.data(), rows.data() + rows.size());
+  return Seen(chosen, cycles, measured, twists, poses, first_cycle, sensor).points;
 }
 
-Array covariances_of(const Ints& rows, const Array& covariances) {
-  Array out(Shape{rows.shape(0), 2, 2});
-  for (Index i = 0; i < rows.shape(0); ++i)
-    std::copy_n(covariances.data() + 4 * rows.data()[i], 4, out.mutable_data() + 4 * i);
-  return out;
+// Whiten rows, weight them by Huber's loss (0 where `counts` is false), and return the parts of `Rows`.
+py::tuple weighted(const py::tuple& terms, const Ints& cycle, const Ints& columns, const bool* counts,
+                   const Ints& control_keys, double huber, Index first_pose, const Ints& sensor_key) {
+  Array residual = terms[0].cast<Array>(), jacobian = terms[2].cast<Array>();
+  const Array sigma = terms[1].cast<Array>();
+  const Index m = cycle.size(), p = columns.shape(1), width = jacobian.shape(1), head = 1 + sensor_key.size();
+  Ints keys(Shape{m, head + p});
+  for (Index i = 0; i < m; ++i) {
+    const double s = sigma.data()[i];
+    double weight = std::sqrt(1.0 / std::max(std::abs(residual.data()[i] / s) / huber, 1.0));
+    weight *= (counts == nullptr || counts[i] ? 1.0 : 0.0) / s;
+    residual.mutable_data()[i] *= weight;
+    for (Index j = 0; j < width; ++j) jacobian.mutable_data()[i * width + j] *= weight;
+    Index* own = keys.mutable_data() + i * (head + p);
+    own[0] = first_pose + cycle.data()[i];
+    if (head == 2) own[1] = sensor_key.data()[0];
+    for (Index j = 0; j < p; ++j) own[head + j] = control_keys.data()[columns.data()[i * p + j]];
+  }
+  return py::make_tuple(keys, jacobian, residual, cycle);
 }
 
 py::tuple curve_rows(const Curves& curves, const py::tuple& on_curves, const py::tuple& table,
                      const Ints& cycles, const Array& poses, Index first_cycle, const Array& sensor,
-                     const py::tuple& limits, const py::tuple& names) {
+                     const py::tuple& limits, const py::tuple& names, const py::object& stations) {
   const Array control_points = on_curves[0].cast<Array>(), trusted = on_curves[3].cast<Array>();
   const Ints labels = on_curves[1].cast<Ints>(), control_keys = on_curves[2].cast<Ints>();
   const Array active_from = on_curves[4].cast<Array>();
   const Ints cycle = table[0].cast<Ints>(), boundary = table[1].cast<Ints>();
   const py::array_t<bool> used = table[2].cast<py::array_t<bool>>();
-  const Array all_u = table[3].cast<Array>();
-  const double room = limits[0].cast<double>(), sigma_model = limits[2].cast<double>();
-  const double huber = limits[3].cast<double>();
-  const Index first_pose = names[0].cast<Index>(), sensor_key = names[1].cast<Index>();
+  const Array all_u = table[3].cast<Array>(), covariances = table[6].cast<Array>();
+  const double room = limits[0].cast<double>(), huber = limits[3].cast<double>();
+  const Index first_pose = names[0].cast<Index>();
+  const Ints sensor_key(Shape{sensor.size() ? 1 : 0}, std::array{names[1].cast<Index>()}.data());
   expect(boundary.size() == cycle.size() && used.size() == cycle.size() && all_u.size() == cycle.size());
   std::vector<Index> chosen;
   for (Index i = 0; i < cycle.shape(0); ++i)
     if (used.data()[i] && std::binary_search(cycles.data(), cycles.data() + cycles.shape(0), cycle.data()[i]))
       chosen.push_back(i);
-  const Index m = static_cast<Index>(chosen.size());
-  const Ints rows(Shape{m}, chosen.data());
-  const Seen seen(rows, cycle, table[4].cast<Array>(), table[5].cast<Array>(), poses, first_cycle, sensor);
+  const Index m = Index(chosen.size());
+  const Seen seen(chosen, cycle, table[4].cast<Array>(), table[5].cast<Array>(), poses, first_cycle, sensor);
   Ints curve(m);
   Array u(m), low(m), high(m);
   for (Index i = 0; i < m; ++i) {
@@ -212,30 +229,36 @@ py::tuple curve_rows(const Curves& curves, const py::tuple& on_curves, const py:
   }
   const py::tuple foot =
       curves.refine(control_points, seen.points, curve, u, low, high, limits[1].cast<int>());
-  const Array found = foot[0].cast<Array>(), basis = foot[6].cast<Array>();
-  const py::array_t<bool> interior = foot[5].cast<py::array_t<bool>>();
-  const Ints columns = foot[8].cast<Ints>();
-  const py::tuple terms = detection_rows(seen.points, covariances_of(rows, table[6].cast<Array>()), seen.pose,
-                                         foot[3].cast<Array>(), foot[4].cast<Array>(), basis, seen.measured,
-                                         seen.twist, sensor, sigma_model);
-  Array residual = terms[0].cast<Array>(), jacobian = terms[2].cast<Array>();
-  const Array sigma = terms[1].cast<Array>();
-  const Index p = basis.shape(1), width = jacobian.shape(1), head = sensor.size() ? 2 : 1;
-  Ints keys(Shape{m, head + p});
+  const Array found = foot[0].cast<Array>();
   bool reached = false;
-  for (Index i = 0; i < m; ++i) {
-    const double r = residual.data()[i], s = sigma.data()[i];
-    double weight = std::sqrt(1.0 / std::max(std::abs(r / s) / huber, 1.0));
-    weight *= (interior.data()[i] ? 1.0 : 0.0) / s;
-    residual.mutable_data()[i] = r * weight;
-    for (Index j = 0; j < width; ++j) jacobian.mutable_data()[i * width + j] *= weight;
-    Index* own = keys.mutable_data() + i * (head + p);
-    own[0] = first_pose + seen.cycle.data()[i];
-    if (head == 2) own[1] = sensor_key;
-    for (Index j = 0; j < p; ++j) own[head + j] = control_keys.data()[columns.data()[i * p + j]];
+  for (Index i = 0; i < m; ++i)
     reached |= !curves.periodic && found.data()[i] <= active_from.data()[curve.data()[i]];
+  const py::array_t<bool> interior = foot[5].cast<py::array_t<bool>>();
+  const auto parts = [&](const py::tuple& terms, const Ints& own, const Ints& columns, const bool* counts) {
+    return weighted(terms, own, columns, counts, control_keys, huber, first_pose, sensor_key);
+  };
+  const py::tuple across =
+      detection_rows(seen.points, taken(covariances, chosen), seen.pose, foot[3].cast<Array>(),
+                     foot[4].cast<Array>(), foot[6].cast<Array>(), seen.measured, seen.twist, sensor,
+                     limits[2].cast<double>());
+  py::list groups;
+  groups.append(parts(across, seen.cycle, foot[8].cast<Ints>(), interior.data()));
+  if (!stations.is_none()) {
+    const py::tuple laid = stations.cast<py::tuple>();
+    const Ints station = table[7].cast<Ints>(), columns = laid[2].cast<Ints>();
+    std::vector<Index> rows, at, controls;
+    for (const Index row : chosen)
+      if (station.data()[row] >= 0) rows.push_back(row), at.push_back(station.data()[row]);
+    const Ints own = taken(columns, at);
+    controls.assign(own.data(), own.data() + own.size());
+    const Seen there(rows, cycle, table[4].cast<Array>(), table[5].cast<Array>(), poses, first_cycle, sensor);
+    const py::tuple along = station_rows(
+        there.points, taken(covariances, rows), there.pose, taken(laid[0].cast<Array>(), at),
+        taken(laid[1].cast<Array>(), at), taken(control_points, controls), there.measured,
+        there.twist, sensor, taken(laid[3].cast<Array>(), at));
+    groups.append(parts(along, there.cycle, own, nullptr));
   }
-  return py::make_tuple(rows, found, reached, py::make_tuple(keys, jacobian, residual, seen.cycle));
+  return py::make_tuple(Ints(Shape{m}, chosen.data()), found, reached, groups);
 }
 
 // --- association ------------------------------------------------------------------------------------------

@@ -96,7 +96,7 @@ void add_factor(double* H, double* g, Index n, const Ints& keys, const Columns& 
   }
 }
 
-py::tuple summed(const py::handle& own_layout, const py::list& factors, const py::sequence& stores,
+py::tuple summed(const py::handle& own_layout, const py::list& factors, const RowStore& rows,
                  const Array& change) {
   const Layout layout(own_layout);
   const Index n = change.shape(0);
@@ -110,9 +110,7 @@ py::tuple summed(const py::handle& own_layout, const py::list& factors, const py
     const py::tuple own = factor.cast<py::tuple>();
     add_factor(H, g, n, own[0].cast<Ints>(), own[1].cast<Columns>(), layout, change.data());
   }
-  for (const py::handle& store : stores)
-    for (const Group& group : store.cast<const RowStore&>().groups())
-      add_group(H, g, n, group, layout, change.data());
+  for (const Group& group : rows.groups()) add_group(H, g, n, group, layout, change.data());
   return py::make_tuple(hessian, gradient);
 }
 
@@ -246,26 +244,10 @@ void Pattern::add(Index width) {
   widths.push_back(width);
 }
 
-RowStore::RowStore(const py::sequence& groups) {
-  for (const py::handle& own : groups) {
-    if (Rows(own).size() == 0) continue;
-    groups_.push_back({Rows(own), Pattern(own)});
-    const auto& [rows, pattern] = groups_.back();
-    expect(Index(pattern.key.size()) == rows.width() && Index(pattern.widths.size()) == rows.keys.shape(1));
-  }
-}
-
 py::list RowStore::parts() const {
   py::list parts;
   for (const Group& group : groups_) parts.append(group.rows.parts());
   return parts;
-}
-
-Ints RowStore::owners() const {
-  std::vector<Index> found;
-  for (const Group& group : groups_)
-    found.insert(found.end(), group.rows.owner.data(), group.rows.owner.data() + group.rows.size());
-  return as_array(found);
 }
 
 Ints RowStore::holding(const Ints& keys) const {
@@ -359,10 +341,8 @@ void add_rows(py::module_& module) {
   module.def("moved_residual", &moved_residual);
   module.def("columns_of", &columns_of);
   py::class_<RowStore>(module, "RowStore")
-      .def(py::init<const py::sequence&>(), py::arg("groups") = py::tuple())
-      .def("__bool__", [](const RowStore& store) { return !store.empty(); })
+      .def(py::init<>())
       .def("copy", [](const RowStore& store) { return RowStore(store); })
-      .def("owners", &RowStore::owners)
       .def("parts", &RowStore::parts)
       .def("holding", &RowStore::holding)
       .def("stale", &RowStore::stale)

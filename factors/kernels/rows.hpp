@@ -80,12 +80,8 @@ struct Group {
 // variables of the same widths are one group, which no call changes: copies of a store share it.
 class RowStore {
  public:
-  explicit RowStore(const py::sequence& groups);
-
-  bool empty() const { return groups_.empty(); }
   const std::vector<Group>& groups() const { return groups_; }
   py::list parts() const;
-  Ints owners() const;
   Ints holding(const Ints& keys) const;
   py::array_t<bool> stale(const Ints& owners, const Ints& keys) const;
   void replace(const Ints& owners, const py::sequence& fresh, const py::handle& layout, const Array& change);

@@ -138,15 +138,15 @@ def by_widths(groups: Sequence[Rows]) -> list[Rows]:
 
 
 def newton_system(
-    graph: gtsam.GaussianFactorGraph, stores: Sequence[kernels.RowStore], layout: Layout, change: Array
+    graph: gtsam.GaussianFactorGraph, rows: kernels.RowStore, layout: Layout, change: Array
 ) -> tuple[Array, Array]:
     """Return the lower triangle of H (n, n), stored by columns, and the negative gradient (n,) at `change`.
 
-    They are sums over the graph and the rows of stores, on the variables of a layout. SingularSystemError
+    They are sums over the graph and the rows of a window, on the variables of a layout. SingularSystemError
     where nothing holds one of them, and ValueError where something holds another one.
     """
     factors = [(keys_of_factor(factor), factor.augmentedInformation()) for factor in factors_of(graph)]
-    hessian, gradient = kernels.summed(layout, factors, stores, change)
+    hessian, gradient = kernels.summed(layout, factors, rows, change)
     missing = layout.keys[hessian.diagonal()[layout.starts] == 0.0]
     if len(missing):
         raise SingularSystemError(f"expected a factor on every variable, found none on {names(missing)}")

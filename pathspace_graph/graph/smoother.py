@@ -214,7 +214,7 @@ class FixedLagSmoother(Generic[M_co]):
         held = self.chain.hold(self.variables) if self.chain is not None else []
         graph = graph_of(self.prior, *user, *held) if user or held else self.prior
         change = self.variables.change(entries)
-        hessian, negative_gradient = newton_system(graph, [self.window.measured], layout, change)
+        hessian, negative_gradient = newton_system(graph, self.window.measured, layout, change)
         if sigma_step is not None:
             points = np.arange(layout.block(SENSOR_LETTER).stop, layout.block(POSE_LETTER).start)
             hessian[points, points] += sigma_step**-2
@@ -269,7 +269,7 @@ class FixedLagSmoother(Generic[M_co]):
             return factorize(self.linear_graph(whole), self.variables.layout).covariance(keys)
         graph = graph_of(self.absolute_prior(), *self.user_factors.linearized(self.variables))
         layout, fresh = self.layout, self.window.fresh_rows(self.cycles)
-        hessian, _ = newton_system(graph, [fresh], layout, np.zeros(layout.size))
+        hessian, _ = newton_system(graph, fresh, layout, np.zeros(layout.size))
         return FactoredSystem(layout, cholesky(hessian)).covariance(keys)
 
     def predicted_covariance(self, rows: Rows, together: int = 1) -> Array:

@@ -1,6 +1,7 @@
 """The curves for the engine: rows of detections and of new control points, also as GTSAM's own factors."""
 
 from collections.abc import Callable, MutableSequence
+from itertools import starmap
 from typing import Any, Final, Self
 
 import gtsam
@@ -15,7 +16,6 @@ from pathspace_graph.factors.gtsam_factors import (
     spline_projection_factors,
     station_factors,
 )
-from pathspace_graph.factors.noise import huber_weights
 from pathspace_graph.graph.rows import Rows, among
 from pathspace_graph.graph.variables import FIRST_POSE, NO_KEYS, POINT, SENSOR_KEY, pose_key, pose_keys
 from pathspace_graph.io.map import NO_CONES
@@ -64,14 +64,15 @@ class CurveMap:
         """Linearize `w_i n_i . (R z_i + t - S(u_i)) / sigma_i` for the used detections of ascending cycles.
 
         The keys are [pose | control points of the span]; w is the root of the Huber weight, and zero if the
-        foot point is not interior. `linearized` stores the refined parameters u. The weak priors of the
-        cycles follow.
+        foot point is not interior. `linearized` stores the refined parameters u. Rows along the curves,
+        `w t . (R z + t - S(u)) / sigma` at stations u, and the weak priors of the cycles follow.
         """
         state, detections = self.state, self.detections
         if not state.boundaries or len(cycles) == 0:
             return []
         curves, variables, s = state.curves, self.variables, self.settings.spline
-        rows, u, self.reached_inactive, parts = kernels.curve_rows(
+        on = self.stations
+        rows, u, self.reached_inactive, measured = kernels.curve_rows(
             curves.searched,
             (state.map_points, curves.labels, curves.keys, curves.trusted, curves.active_from),
             detections.associated,
@@ -81,20 +82,11 @@ class CurveMap:
             variables.sensor,
             (s.refine_room, s.refine_iterations, s.sigma_model, self.settings.gate.huber),
             (FIRST_POSE, SENSOR_KEY),
+            None if on is None else (on.value, on.slope, on.columns, on.sigma),
         )
         self._refined = rows, u
-        weak = (one.where(among(one.cycle, cycles)) for one in self.weak.values())
-        return [Rows(*parts), *self._along(rows), *(own for one in weak for own in one.rows(variables))]
-
-    def _along(self, rows: IntArray) -> list[Rows]:
-        """Linearize `w t . (R z + t - S(u)) / sigma` for the detections (m,) with a station u."""
-        detections, stations = self.detections, self.stations
-        rows = rows[detections.station[rows] != NO_STATION]
-        if stations is None or len(rows) == 0:
-            return []
-        seen = stations.rows(self.state, detections, rows)
-        weights = huber_weights(seen.whitened, self.settings.gate.huber)
-        return [seen.weighted(weights, detections.cycle[rows])]
+        weak = (one.where(among(one.cycle, cycles)) for one in self.weak.values() if len(one.cycle))
+        return [*starmap(Rows, measured), *(own for one in weak for own in one.rows(variables))]
 
     def correct(self) -> None:
         """Do nothing: detections are corrected on access."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Final, Self
 
 import numpy as np
@@ -13,10 +14,10 @@ from pathspace_graph.factors.residuals import sigma_across, smoothness_coefficie
 from pathspace_graph.factors.se2 import in_vehicle, left_of, rotations, to_vehicle
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import FIRST_POSE, POINT, SENSOR_KEY, Drives, Variables, pose_keys
+from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.mapping.detections import NO_STATION, DetectionTable
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import GaugeSettings
-from pathspace_graph.spline.boundary import ahead_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,18 +114,19 @@ class CurveStations:
         gaps = np.diff(u[order], append=u[order[0]] + length)
         return cls(label, first, u[order], sigma[order], np.minimum(gaps, np.roll(gaps, 1)), length)
 
+    @cached_property
+    def _around(self) -> tuple[Array, Array]:
+        """Parameters of the stations, on a closed curve with the first one again, and midpoints between."""
+        u = self.u if self.length == np.inf else np.append(self.u, self.u[0] + self.length)
+        return u, 0.5 * (u[:-1] + u[1:])
+
     def nearest(self, u: Array) -> tuple[IntArray, Array]:
         """Return the nearest station to each parameter, of any shape, and the distance beyond it (m)."""
-        if self.length == np.inf:
-            after = self.u.searchsorted(u).clip(1, len(self.u) - 1)
-            both = np.stack([after - 1, after])
-            beyond = u - self.u[both]
-        else:
-            after = self.u.searchsorted(self.u[0] + np.mod(u - self.u[0], self.length))
-            both = np.stack([after - 1, after]) % len(self.u)
-            beyond = ahead_of(self.u[both], u, self.length)
-        second = np.abs(beyond[1]) < np.abs(beyond[0])
-        return np.where(second, both[1], both[0]), np.where(second, beyond[1], beyond[0])
+        around, between = self._around
+        if self.length < np.inf:
+            u = self.u[0] + np.mod(u - self.u[0], self.length)
+        near = between.searchsorted(u)
+        return near % len(self.u), u - around[near]
 
     def matched(self, u: Array, sigma: Array) -> IntArray:
         """Match detections with foot points u (m,) to stations; `NO_STATION` if ambiguous.
@@ -180,8 +182,11 @@ class Stations:
         """
         poses = state.variables.poses_at(detections.cycle[rows])
         sigma = sigma_across(directions, detections.covariance[rows], poses, SIGMA_POSE)
+        colour = np.where(
+            detections.boundary[rows] == detections.label[rows], detections.label[rows], UNKNOWN
+        )
         for curve in self.curves:
-            own = (detections.boundary[rows] == curve.label) & (detections.label[rows] == curve.label)
+            own = colour == curve.label
             detections.match(rows[own], curve.matched(detections.u[rows[own]], sigma[own]))
 
     def rows(self, state: State, detections: DetectionTable, rows: IntArray) -> DetectionRows:

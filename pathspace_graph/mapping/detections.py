@@ -212,10 +212,10 @@ class DetectionTable(DetectionColumns):
         )
 
     @property
-    def associated(self) -> tuple[IntArray, IntArray, BoolArray, Array, Array, Array, Array]:
+    def associated(self) -> tuple[IntArray, IntArray, BoolArray, Array, Array, Array, Array, IntArray]:
         """Columns of the associations and of the measurements."""
         decided = self.cycle, self.boundary, self.used, self.u
-        return *decided, self.measured, self.twist, self.covariance
+        return *decided, self.measured, self.twist, self.covariance, self.station
 
     def used_on(self, label: int) -> IntArray:
         """Rows in use on the boundary `label`."""

@@ -269,7 +269,7 @@ def rows_of(mapper: FixedLagMapper) -> dict[int, Array]:
     kept = mapper.road.smoother.window.measured
     return {
         owner: np.sort(np.concatenate([rows.residual[rows.owner == owner] for rows in rows_in(kept)]))
-        for owner in np.unique(kept.owners()).tolist()
+        for owner in np.unique(np.concatenate([rows.owner for rows in rows_in(kept)])).tolist()
     }
 
 
