@@ -12,9 +12,10 @@ from pathspace_graph.factors.footpoint import foot_points
 from pathspace_graph.factors.se2 import path_lengths
 from pathspace_graph.graph.variables import POINT
 from pathspace_graph.io.map import NO_CONES, Map, SplineBoundary
-from pathspace_graph.labels import BOUNDARIES
+from pathspace_graph.labels import BOUNDARIES, LEFT
+from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.settings.mapper import MapperSettings, SplineSettings, known_settings
-from pathspace_graph.spline.boundary import Boundary
+from pathspace_graph.spline.boundary import Boundary, boundaries_cross, sampled
 from pathspace_graph.spline.bspline import BSpline, end_change_matrix
 
 from .simplification import fit_through
@@ -35,6 +36,7 @@ class KnownMap:
     covariance: Array  # (n, n) of the distinct control points, left first, in m^2
     cones: dict[int, Array]  # (k, 2) cones of each curve: parameters, and sigmas along it (m)
     kept: bool  # whether the map is fixed
+    crosses: bool  # whether both curves cross elsewhere than where the left one crosses itself
 
     @classmethod
     def of(cls, track: Map, keep: bool = False, of_lines: bool = False) -> Self:
@@ -57,7 +59,8 @@ class KnownMap:
         T = block_diag(*changes)
         floor = FLOOR**2 * np.eye(len(T))
         joint = KEPT**2 * np.eye(len(T)) if keep else T @ covariance @ T.T + floor
-        return cls(splines, confirmed, joint, cones, keep)
+        crosses = boundaries_cross(splines, SAMPLE, sampled(splines[LEFT], SAMPLE))
+        return cls(splines, confirmed, joint, cones, keep, crosses)
 
     @property
     def ends(self) -> dict[int, float]:

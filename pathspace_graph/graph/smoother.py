@@ -432,9 +432,8 @@ def forget_poses(smoother: Smoother, first_cycle: int) -> None:
 def restart(smoother: Smoother, first_cycle: int) -> None:
     """Make all variables active, and drop the prior; poses before `first_cycle` leave the window.
 
-    A new prior must be set, on all that remains.
+    The inactive variables must be up to date. A new prior must be set, on all that remains.
     """
-    smoother.transform_to_origin()
     smoother.map.activate_all()
     smoother.inactive = InactiveMap()
     smoother.held, smoother.prior = None, gtsam.GaussianFactorGraph()

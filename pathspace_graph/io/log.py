@@ -109,6 +109,8 @@ class Detections(Brief):
 
     def with_others(self, other: Detections) -> Detections:
         """Append other detections of the same cycle."""
+        if len(other.labels) == 0:
+            return self
         names = ("points_vehicle", "covariances", "labels")
         return Detections(
             self.t, *(np.concatenate([getattr(of, name) for of in (self, other)]) for name in names)

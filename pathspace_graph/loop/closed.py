@@ -13,7 +13,6 @@ from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.smoother import forget_poses
 from pathspace_graph.health import DEGRADED, GOOD, LOST, Health
 from pathspace_graph.io.log import Detections
-from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.loop.closing import fix_gauge
 from pathspace_graph.loop.drive import Drive, Phase, Step
 from pathspace_graph.loop.known_loop import KnownLoop, MapRepair, evidence_of
@@ -21,9 +20,7 @@ from pathspace_graph.loop.lap_solver import Outcome, Unsolved
 from pathspace_graph.mapping.detections import DetectionColumns
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.mapping.smoother import CurveSmoother
-from pathspace_graph.mapping.state import SAMPLE
 from pathspace_graph.places.find import STRETCH, KnownRoad, Place, Prior, place_on, sure
-from pathspace_graph.spline.boundary import boundaries_cross
 
 FOUND: Final = "the vehicle was lost, and is found again"  # notice of a relocalization
 SEARCH_INTERVAL: Final = 0.5  # least time between two attempts (s)
@@ -136,11 +133,11 @@ def widened(place: Place) -> Array:
 class Closed(Phase):
     """Refinement and repair of a closed map."""
 
-    def __init__(self, road: Road, drive: Drive) -> None:
-        """Start just after the curves were closed."""
+    def __init__(self, road: Road, boundaries_cross: bool = False) -> None:
+        """Start just after the curves were closed: by a batch, whose boundaries do not cross, or as known."""
         self.map_repair = MapRepair(road.settings)
         self.known_loop = KnownLoop()
-        self._boundaries_cross = _crosses(road, drive)
+        self._boundaries_cross = boundaries_cross
         self._settled = road.path.length  # path length at the last replacement of the map (m)
         road.growth.tentative.clear()
 
@@ -185,8 +182,7 @@ class Closed(Phase):
         if solved is None or not notice:
             return Step(self)
         jump = drive.take(road, solved)
-        self._boundaries_cross = _crosses(road, drive)
-        self._settled = road.path.length
+        self._boundaries_cross, self._settled = False, road.path.length
         return Step(self, jump, notice)
 
     def _repair(self, road: Road, drive: Drive, reading: Reading) -> str:
@@ -204,10 +200,3 @@ class Closed(Phase):
             return ""
         self.known_loop = KnownLoop()
         return self.map_repair.in_place(road.smoother)
-
-
-def _crosses(road: Road, drive: Drive) -> bool:
-    """Whether both boundaries cross beside the driven path."""
-    road.smoother.refresh()
-    splines, driven = road.smoother.map.state.splines, drive.record.poses[:, :2]
-    return set(splines) == set(BOUNDARIES) and boundaries_cross(splines, SAMPLE, driven)

@@ -117,7 +117,7 @@ class Open(Phase):
         if self._closes:
             road.smoother.settle()
             jump = drive.take(road, outcome, self.asked_by)
-            return Step(self.CLOSED(road, drive), jump)
+            return Step(self.CLOSED(road), jump)
         if road.growth.taken_back > self._taken_back:
             return Step(self, notice=f"{failed}: a curve was taken back")
         notice = "" if drive.revisits else REVISITED  # only the first time
@@ -154,7 +154,8 @@ class ReturnFinder(Copyable):
         """Return the newest pose relative to an early one, if it is recognized there."""
         length, cycle, closing = road.path.length, road.next_cycle, self._settings.closing
         tried, tried_cycle = self._tried
-        waited = length >= tried + closing.check_interval or cycle >= tried_cycle + RETURN_CYCLES
+        interval = closing.check_interval * (2.0 if road.grown else 1.0)  # growth, too, takes time
+        waited = length >= tried + interval or cycle >= tried_cycle + RETURN_CYCLES
         if length < self._rests_until or not waited:
             return None
         self._tried = length, cycle
@@ -281,7 +282,7 @@ class Seeking(Phase):
         if place is None:
             return Step(self, step.jump, step.notice, step.health)
         jump = drive.take_known(road, self.known, place.pose, widened(place))
-        phase = Closed(road, drive) if self.known.closed else OnOpenMap()
+        phase = Closed(road, self.known.crosses) if self.known.closed else OnOpenMap()
         return Step(phase, jump, "; ".join(filter(None, [step.notice, PLACED])), Health(DEGRADED, PLACED))
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:

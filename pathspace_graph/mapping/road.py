@@ -100,7 +100,7 @@ class Road:
             self.grown, notice = self.growth.expand(self.smoother, path_ahead)
             if self.grown:
                 self.smoother.map.lay_out_stations()  # control points are on other rows
-        self.smoother.deactivate_distant()
+        self.smoother.deactivate_distant(spare=not self.grown)
         return notice
 
     def update(self) -> None:

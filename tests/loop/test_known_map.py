@@ -244,6 +244,17 @@ def test_a_failed_search_leaves_the_road_alone() -> None:
     np.testing.assert_array_equal(seeking.control_points(LEFT), alone.control_points(LEFT))
 
 
+@pytest.mark.parametrize(("shift", "crosses"), [(0.0, False), (6.0, True)])
+def test_boundaries_cross_but_for_a_level_crossing_of_their_road(shift: float, crosses: bool) -> None:
+    """A figure of eight 80 m long, with 4 m between its boundaries, or with the right one shifted."""
+    phi = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    line = 40.0 * np.column_stack([np.sin(phi), 0.5 * np.sin(2.0 * phi)])
+    tangent = np.column_stack([np.cos(phi), np.cos(2.0 * phi)])
+    left = 2.0 * np.column_stack([-tangent[:, 1], tangent[:, 0]]) / np.hypot(*tangent.T)[:, None]
+    known = map_of_cones(line + left, line - left + [0.0, shift], True, SIGMA)
+    assert KnownMap.of(known).crosses == crosses
+
+
 def test_what_cannot_be_a_known_map_is_refused() -> None:
     whole = pear_map()
     bare = {label: SplineBoundary(one.spline, NO_COVARIANCE) for label, one in whole.boundaries.items()}  # type: ignore[union-attr]

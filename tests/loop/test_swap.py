@@ -297,7 +297,7 @@ def test_the_batch_of_the_lap_has_the_users_factors_on_poses() -> None:
 
     assert error(known) < 0.006  # m; a batch without them has 0.03
     assert error(usual) > 0.02
-    assert abs(error(poor) - error(usual)) < 0.01  # the loop closes a cycle later
+    assert 0.02 < error(poor) < 0.05  # the loop closes some cycles later
 
 
 ASIDE = 0.4  # of a surveyed point from the left curve (m)

@@ -49,3 +49,15 @@ def test_control_points_that_a_detection_holds_stay_active() -> None:
     detections.refine(row, np.array([behind]))
     smoother.deactivate_distant()
     assert state.boundaries[LEFT].tables.span_of(behind - 2.0) == state.active(LEFT)[0]
+
+
+def test_a_cycle_without_time_to_spare_waits_for_twice_the_stretch(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper, _ = map_log(exact_log(ahead(10.0, 12.0), *corridor(150.0)))
+    smoother = mapper.road.smoother
+    state, spacing = smoother.map.state, smoother.map.settings.spline.spacing
+    first = {label: state.active(label)[0] for label in state.boundaries}
+    for stretch, spare, leaves in ((11.0, True, False), (18.0, False, False), (18.0, True, True)):
+        kept = {label: state.active(label)[round(stretch / spacing) :] for label in first}
+        monkeypatch.setattr(smoother, "_needed", lambda label, room=0.0, kept=kept: kept[label])
+        smoother.deactivate_distant(spare)
+        assert all(state.active(label)[0] > first[label] for label in first) == leaves
