@@ -17,6 +17,7 @@ from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.residuals import chi2_quantile, landmark_residuals
 from pathspace_graph.front_end.front_end import Reading
 from pathspace_graph.graph.elimination import Elimination
+from pathspace_graph.graph.gaussian import upper_root
 from pathspace_graph.graph.smoother import FixedLagSmoother, restart, set_prior
 from pathspace_graph.graph.variables import ONE_DRIVE, POINT, POSE
 from pathspace_graph.io.log import Log
@@ -195,7 +196,8 @@ class LandmarkFixedLag(landmarks.OnlineBaseline):
         restart(smoother, first)
         variables = smoother.variables
         variables.values = solved.variables.values[solved.variables.layout.entries(variables.keys)]
-        set_prior(smoother, *system.marginal(solved, first))
+        keys, mean, information = system.marginal(solved, first)
+        set_prior(smoother, keys, mean, upper_root(information))
         for _ in range(self.settings.closing.iterations):
             smoother.step()
 

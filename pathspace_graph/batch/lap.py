@@ -19,15 +19,17 @@ from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
-from pathspace_graph.factors.arrays import Array, BoolArray
+from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths, to_map
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import marginal_before
+from pathspace_graph.graph.gaussian import upper_root
 from pathspace_graph.graph.rows import Revisit
-from pathspace_graph.graph.variables import POSE
+from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detection_rows import Stations
 from pathspace_graph.mapping.detections import DetectionTable
+from pathspace_graph.mapping.smoother import FAR_ROOM
 from pathspace_graph.mapping.state import SAMPLE, GivenFactor, State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import (
@@ -45,6 +47,7 @@ from .system import BatchSystem, Convergence, Effort, Evaluation, Optimizer, Sta
 
 FROM_MAP: Final = Effort(rough_rounds=8, rounds=20, tolerance=10.0)  # limited, to finish in time
 FROM_ODOMETRY: Final = Effort(rounds=24, tolerance=10.0)
+AHEAD_SHARE: Final = 0.06  # way until the result is used, by that of the drive: twice `CYCLES_SHARE` of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +79,10 @@ class LapMarginal:
     poses: Array  # (P, 3) poses of all cycles, map frame
     first_kept: int  # cycle that ends the marginal: it has all measurements of earlier poses, and no others
     mean: Array  # (n,) mean of the marginal
-    information: Array  # (n, n) its information, the inverse of its covariance
+    root: Array  # (n, n) upper triangular square root R of its information `R' R`, columns in this order:
+    order: IntArray  # (n,) its variables, those that the window will not reach first
+    near: dict[int, IntArray]
+    """(k,) control points of closed curves that the window may reach, in driving order; all if missing."""
     scatter: dict[int, Array]
     """(m,) sigma of each closed boundary's control points by the scatter of its cones (m)."""
     cones: dict[int, Array]
@@ -87,6 +93,12 @@ class LapMarginal:
     @property
     def closed(self) -> bool:
         return any(spline.periodic for spline in self.splines.values())
+
+    @property
+    def information(self) -> Array:
+        """Information (n, n) of the marginal, the inverse of its covariance."""
+        by_entry = self.root[:, np.argsort(self.order)]
+        return np.asarray(by_entry.T @ by_entry)
 
 
 def solve_lap(lap: OpenLap) -> LapMarginal:
@@ -107,6 +119,8 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             calibration, earlier = at.state.variables.calibration, lap.revisits[1:]
             objection = disagreement(system, at.state.poses, calibration, earlier)
         information, mean, dense = marginal_of(system, at, few, change, lap.first_kept)
+        near = reached_next(few, lap) if few.closed else {}
+        order = far_first(few, near, len(at.state.variables.calibrations), len(mean))
         if system.stations is not None:
             cones = stations_on(few, system.stations, at.state, change, dense)
         elif at.state.closed:
@@ -122,7 +136,9 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             poses=at.state.poses.copy(),
             first_kept=lap.first_kept,
             mean=mean,
-            information=information,
+            root=upper_root(information[np.ix_(order, order)]),
+            order=order,
+            near=near,
             scatter=scatter,
             cones=cones,
             seconds=time.perf_counter() - begin,
@@ -169,6 +185,30 @@ def marginal_of(
     dense = np.asarray(covariance[first:last, first:last], np.float64)
     covariance = T @ covariance @ T.T
     return np.asarray(np.linalg.inv(0.5 * (covariance + covariance.T)), np.float64), mean, dense
+
+
+def reached_next(few: State, lap: OpenLap) -> dict[int, IntArray]:
+    """Control points (k,) of closed curves, by label, that the window may reach once it has the map.
+
+    The vehicle drives on while the batch runs, for a share of the drive so far.
+    """
+    gate, slide = lap.settings.gate, lap.settings.spline.refine_room
+    meanwhile, near = AHEAD_SHARE * path_lengths(few.poses)[-1], dict[int, IntArray]()
+    for label, boundary in few.boundaries.items():
+        u = few.pose_u[label][lap.first_kept :]
+        ahead = gate.view_ahead + gate.station_ahead + FAR_ROOM + meanwhile
+        near[label] = boundary.stretch(u.min() - gate.view_behind - slide, u.max() + ahead + slide)
+    return near
+
+
+def far_first(few: State, near: Mapping[int, IntArray], before: int, count: int) -> IntArray:
+    """Order the `count` entries of [calibration (before,) | control points | pose], far points first."""
+    is_far = np.zeros((len(few.map_points), POINT), bool)
+    for label, points in near.items():
+        first = map_block(few, label).start // POINT
+        is_far[first + np.delete(few.boundaries[label].everything, points)] = True
+    far = before + np.flatnonzero(is_far)
+    return np.concatenate([far, np.setdiff1d(np.arange(count), far)])
 
 
 def stations_on(

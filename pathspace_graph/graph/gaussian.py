@@ -75,6 +75,11 @@ def cholesky(hessian: Array) -> Array:
     return np.asarray(factor)
 
 
+def upper_root(information: Array) -> Array:
+    """Return the upper triangular R of `R' R = H` (n, n)."""
+    return np.asarray(np.linalg.cholesky(information).T, np.float64)
+
+
 def solve(factor: Array, vector: Array) -> Array:
     """Return `H^-1 g` from the lower factor of H, for g (n,) or (n, k)."""
     solution, _ = lapack.dpotrs(factor, vector, lower=1)

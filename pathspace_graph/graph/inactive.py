@@ -179,16 +179,20 @@ class InactiveMap:
         """Move variables (k,) and keyframes from a prior to the net; return what remains."""
         frontals = np.intersect1d(np.append(keys, keyframes), keys_of(prior))
         conditional, remaining = eliminate(prior, frontals)
+        self._old_anchors = np.union1d(self._old_anchors, keyframes)
+        self.add(conditional, keys)
+        return remaining
+
+    def add(self, conditional: gtsam.GaussianConditional, keys: IntArray) -> None:
+        """Add the conditional of variables (k,), and perhaps of keyframes, given others."""
         self.net.push_back(conditional)
         self.keys = np.union1d(self.keys, keys)
-        self._old_anchors = np.union1d(self._old_anchors, keyframes)
-        separator = keys_of_factor(conditional)[len(frontals) :]
+        separator = np.setdiff1d(keys_of_factor(conditional), np.append(self.keys, self._old_anchors))
         self.anchors = separator[are_poses(separator)]
         self._given = np.setdiff1d(
             np.union1d(self._given, separator), np.append(self.keys, self._old_anchors)
         )
         self._active = None
-        return remaining
 
     def refresh(self, variables: Variables) -> None:
         """Update the inactive variables, given the active ones."""

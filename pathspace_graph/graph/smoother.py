@@ -14,7 +14,7 @@ import numpy as np
 
 from pathspace_graph.copies import shallow
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.linear import keys_of_factor
+from pathspace_graph.factors.linear import keys_of_factor, linear_factor
 from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.se2 import compose
 
@@ -27,6 +27,7 @@ from .gaussian import (
     cholesky,
     factorize,
     graph_of,
+    jacobian_factor,
     marginalize,
     merge_variables,
     remove_information,
@@ -35,7 +36,17 @@ from .gaussian import (
 )
 from .inactive import Attached, InactiveChain, InactiveMap
 from .rows import Rows, at_values, calibrated_delta, newton_system, predicted_covariance, stacked_factor
-from .variables import CALIBRATION_KEY, POSE, POSE_LETTER, SENSOR_LETTER, Layout, pose_key, pose_keys, sizes
+from .variables import (
+    CALIBRATION_KEY,
+    NO_KEYS,
+    POSE,
+    POSE_LETTER,
+    SENSOR_LETTER,
+    Layout,
+    pose_key,
+    pose_keys,
+    sizes,
+)
 from .window import M_co, MapRows, SmootherSettings, UserFactors, WindowFactors, check_factors, values_of
 
 NO_INFORMATION: Final = 1e-10  # a factor that removes less of a variance than this share says nothing
@@ -452,11 +463,20 @@ def _drop_before(smoother: Smoother, first_cycle: int) -> None:
     smoother.window.clear()
 
 
-def set_prior(smoother: Smoother, keys: IntArray, mean: Array, information: Array) -> None:
-    """Set the prior to a Gaussian of ascending keys (k,), with mean (n,) and information (n, n)."""
-    root = np.asarray(np.linalg.cholesky(information).T, np.float64)
-    prior = absolute_factor(keys, root, smoother.variables, mean)
-    smoother.prior = graph_of(gtsam.HessianFactor(graph_of(prior)))
+def set_prior(smoother: Smoother, keys: IntArray, mean: Array, root: Array, far: IntArray = NO_KEYS) -> None:
+    """Set the prior to a Gaussian of ascending keys (k,) with mean (n,) and information `R' R`.
+
+    The columns of the root R (n, n) are by the map points `far`, ascending, and then by the other keys. It is
+    upper triangular if there are any: these become inactive.
+    """
+    order, count = np.concatenate([far, np.setdiff1d(keys, far)]), int(sizes(far).sum())
+    change = mean - smoother.variables.reference[smoother.variables.layout.entries(keys)]
+    right = root @ change[Layout(keys).entries(order)]
+    if len(far):
+        leaving = linear_factor(order, sizes(order), root[:count], right[:count], len(far))
+        smoother.inactive.add(leaving, far)
+    near = jacobian_factor(order[len(far) :], root[count:, count:], right[count:])
+    smoother.prior = graph_of(gtsam.HessianFactor(graph_of(near)))
 
 
 def exchange_calibration_priors(smoother: Smoother, included: tuple[Array, Array]) -> None:

@@ -10,10 +10,11 @@ from scipy.linalg import block_diag
 from pathspace_graph.batch.association import POSE_STEP, headings, locate_poses
 from pathspace_graph.batch.known_map import KnownMap
 from pathspace_graph.batch.lap import LapMarginal
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.se2 import compose, inverse, left_of, move_points
+from pathspace_graph.graph.gaussian import upper_root
 from pathspace_graph.graph.smoother import exchange_calibration_priors, hold_motion, restart, set_prior
-from pathspace_graph.graph.variables import pose_keys
+from pathspace_graph.graph.variables import NO_KEYS, pose_keys
 from pathspace_graph.mapping.road import Road
 from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.mapping.state import GivenFactor, State
@@ -39,7 +40,8 @@ class NewMap:
     calibration: Array  # (2,) or (7,) calibration of odometry and sensor
     known: dict[int, int]  # number of first control points of each curve that the prior holds
     mean: Array  # (n,) mean of the prior
-    information: Array  # (n, n) inverse of its covariance
+    root: Array  # (n, n) square root of its information, as in `LapMarginal.root`
+    near: dict[int, IntArray] = field(default_factory=dict)  # as in `LapMarginal.near`
     scatter: dict[int, Array] = field(default_factory=dict)  # as in `CurveMap.replaced_by`
     cones: dict[int, Array] = field(default_factory=dict)
 
@@ -77,9 +79,12 @@ def replace_map(
             _locate_first(state)
     held = [state.control_keys(label)[: new.known[label]] for label in state.boundaries]
     keys = np.concatenate([variables.calibration_keys, *held, pose_keys(np.array([cycle]))])
-    set_prior(smoother, keys, new.mean, new.information)
-    if are_new:
-        later = [one for one in given if one.cycle >= smoother.first_cycle and one.points]
+    far = [np.delete(state.control_keys(label), near) for label, near in new.near.items()]
+    set_prior(smoother, keys, new.mean, new.root, np.concatenate([NO_KEYS, *far]))
+    state.activate_only(dict(new.near))
+    later = [one for one in given if one.cycle >= smoother.first_cycle and one.points]
+    if are_new and later:
+        smoother.reactivate()
         smoother.add_to_prior([rows for one in later for rows in one.on(state)])
     if state.closed:
         smoother.deactivate_distant()  # most of a long map: the window does not reach it
@@ -120,7 +125,8 @@ def take_marginal(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor
         marginal.calibration,
         {label: spline.size for label, spline in marginal.splines.items()},
         marginal.mean,
-        marginal.information,
+        marginal.root,
+        marginal.near,
         marginal.scatter,
         marginal.cones,
     )
@@ -149,7 +155,7 @@ def take_known(road: Road, known: KnownMap, pose: Array, covariance: Array) -> A
         state.variables.calibrations.copy(),
         {label: len(own) for label, (_, own) in curves.items()},
         np.concatenate([state.variables.calibrations, *(own.ravel() for own in points), pose]),
-        block_diag(*map(np.linalg.inv, parts)),
+        block_diag(*(upper_root(np.asarray(np.linalg.inv(part), np.float64)) for part in parts)),
         cones=known.cones,
     )
     road.growth.wait_for({} if known.closed else known.ends)

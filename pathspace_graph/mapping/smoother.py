@@ -215,19 +215,13 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         if not boundary.periodic:
             low = float(self.map.detections.u[self.map.detections.used_on(label)].min(initial=low))
         low -= slide
-        high = float(pose_u.max()) + gate.view_ahead + gate.station_ahead + slide + room
-        if boundary.periodic and high - low >= boundary.length:
-            return boundary.everything
-        first, last = boundary.tables.span_of(low), boundary.tables.span_of(high)
-        if not boundary.periodic:
-            weak = self.map.weak.get(label)  # an end that was carried on may lie farther behind
-            if weak is not None and len(weak.keys):
-                first = min(first, int(weak.triples.min() - self.map.state.control_keys(label)[0]))
-            return np.arange(first, boundary.size)
-        last += boundary.degree + (boundary.size if last < first else 0)
-        if last - first >= boundary.size - 1:
-            return boundary.everything
-        return np.arange(first, last + 1) % boundary.size
+        if boundary.periodic:
+            ahead = gate.view_ahead + gate.station_ahead + slide + room
+            return boundary.stretch(low, float(pose_u.max()) + ahead)
+        first, weak = boundary.tables.span_of(low), self.map.weak.get(label)
+        if weak is not None and len(weak.keys):  # an end that was carried on may lie farther behind
+            first = min(first, int(weak.triples.min() - self.map.state.control_keys(label)[0]))
+        return np.arange(first, boundary.size)
 
 
 def _holds(active: IntArray, needed: IntArray, size: int) -> bool:

@@ -97,6 +97,14 @@ class Boundary:
         columns = span[:, None] - self.degree + np.arange(self.degree + 1)
         return columns % self.size if self.periodic else columns
 
+    def stretch(self, low: float, high: float) -> IntArray:
+        """Indices (k,) of the control points that shape a closed curve between two parameters, in order."""
+        first, last = self.tables.span_of(low), self.tables.span_of(high)
+        last += self.degree + (self.size if last < first else 0)
+        if high - low >= self.length or last - first >= self.size - 1:
+            return self.everything
+        return np.arange(first, last + 1) % self.size
+
     def spline(self, control_points: Array) -> BSpline:
         return BSpline.on(self.tables, self.extended(control_points))
 
