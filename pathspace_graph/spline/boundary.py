@@ -100,7 +100,8 @@ class Boundary:
     def stretch(self, low: float, high: float) -> IntArray:
         """Indices (k,) of the control points that shape a closed curve between two parameters, in order."""
         first, last = self.tables.span_of(low), self.tables.span_of(high)
-        last += self.degree + (self.size if last < first else 0)
+        is_long = high - low > 0.5 * self.length  # it may end on the span where it begins
+        last += self.degree + (self.size if last < first or (last == first and is_long) else 0)
         if high - low >= self.length or last - first >= self.size - 1:
             return self.everything
         return np.arange(first, last + 1) % self.size

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pathspace_graph.batch.lap import LapMarginal, OpenLap, lap_optimum, marginal_of, solve_lap
+from pathspace_graph.batch.lap import (
+    LapMarginal,
+    OpenLap,
+    far_first,
+    lap_optimum,
+    marginal_of,
+    reached_next,
+    solve_lap,
+)
 from pathspace_graph.batch.mapper import BatchMapper
 from pathspace_graph.batch.start import StartMap
 from pathspace_graph.batch.system import BatchSystem, Effort, Evaluation, weak_priors
@@ -119,6 +127,30 @@ def test_the_mean_of_the_marginal_is_near_the_optimum_by_its_own_covariance() ->
     optimum = np.concatenate([marginal.calibration, *points, marginal.poses[first]])
     off = optimum - marginal.mean
     assert off @ marginal.information @ off < len(off)
+
+
+def test_the_root_is_triangular_with_the_control_points_first_that_the_window_does_not_reach() -> None:
+    lap = open_lap()
+    near = dict.fromkeys(BOUNDARIES, np.arange(3))
+    state = optimum()[1].state
+    sizes = [state.boundaries[label].size for label in BOUNDARIES]
+    count = 2 + 2 * sum(sizes) + 3
+    order = far_first(state, near, 2, count)
+    far = [2 + 2 * 3 + k for k in range(2 * (sizes[0] - 3))]
+    far += [2 + 2 * (sizes[0] + 3) + k for k in range(2 * (sizes[1] - 3))]
+    assert order[: len(far)].tolist() == far
+    assert sorted(order.tolist()) == list(range(count))
+    marginal = solved()
+    np.testing.assert_array_equal(np.tril(marginal.root, -1), 0.0)
+    by_entry = np.empty_like(marginal.root)
+    by_entry[:, marginal.order] = marginal.root
+    np.testing.assert_allclose(marginal.information, by_entry.T @ by_entry)
+    reached = reached_next(state, lap)
+    for label, boundary in state.boundaries.items():
+        window = state.pose_u[label][lap.first_kept :]
+        seen = np.linspace(window.min(), window.max() + lap.settings.gate.view_ahead, 100)
+        shaping = boundary.columns(boundary.tables.evaluate(seen)[1])
+        assert set(shaping.ravel().tolist()) <= set(reached[label].tolist())
 
 
 def test_few_rounds_do_not_converge() -> None:

@@ -9,9 +9,9 @@ from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.odometry import integrate_twists
 from pathspace_graph.factors.se2 import compose
-from pathspace_graph.graph.gaussian import factorize, keys_of, normal_equations
+from pathspace_graph.graph.gaussian import factorize, keys_of, normal_equations, upper_root
 from pathspace_graph.graph.rows import Rows, calibrated_delta
-from pathspace_graph.graph.smoother import FixedLagSmoother, merge_points
+from pathspace_graph.graph.smoother import FixedLagSmoother, merge_points, restart, set_prior
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, control_keys, pose_key, pose_keys
 from pathspace_graph.graph.window import SmootherSettings
 from pathspace_graph.online.fixed_lag import FixedLagMapper
@@ -393,3 +393,26 @@ def test_covariance_is_the_dense_inverse_of_the_graph_at_the_estimate() -> None:
     entries = columns_of(keys, smoother.layout.keys)
     expected = np.linalg.inv(hessian)[np.ix_(entries, entries)]
     np.testing.assert_allclose(smoother.covariance(keys), expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("far", [[], [1, 4], [0, 2, 3, 5]])
+def test_a_prior_whose_far_points_are_inactive_is_the_same_gaussian(far: list[int]) -> None:
+    """The joint of active and inactive variables is the given one, and `refresh` gives the mean."""
+    rng, smoother = np.random.default_rng(3), FixedLagSmoother(SETTINGS, LinearTrack(0))
+    points = control_keys(0, np.arange(6))
+    smoother.variables.insert(points, rng.normal(size=12))
+    smoother.add_first_pose(0.0, np.zeros(3), np.eye(3))
+    variables, layout = smoother.variables, smoother.variables.layout
+    restart(smoother, 0)
+    A, mean = rng.normal(size=(30, layout.size)), rng.normal(size=layout.size)
+    order = layout.entries(np.concatenate([points[far], np.setdiff1d(layout.keys, points[far])]))
+    root = upper_root((A.T @ A)[np.ix_(order, order)])
+    set_prior(smoother, layout.keys, mean, root, points[far])
+    np.testing.assert_array_equal(smoother.layout.keys, np.setdiff1d(layout.keys, points[far]))
+    H, g = normal_equations(smoother.inactive.joint_prior(smoother.prior), layout)
+    np.testing.assert_allclose(H, A.T @ A, atol=1e-9 * np.abs(H).max())
+    np.testing.assert_allclose(g, A.T @ A @ (mean - variables.reference), atol=1e-9 * np.abs(g).max())
+    entries = layout.entries(smoother.layout.keys)
+    variables.values[entries] = mean[entries]
+    smoother.refresh()
+    np.testing.assert_allclose(variables.values, mean, atol=1e-9)

@@ -151,6 +151,18 @@ def test_new_knots_have_new_keys() -> None:
     assert closed.size == 8 and closed.length == 24.0
 
 
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [(4.0, 7.0), (22.0, 29.0), (-2.0, 1.0), (46.0, 50.0), (3.0, 15.0), (1.0, 24.9), (0.0, 70.0)],
+)
+def test_a_stretch_of_a_closed_curve_has_every_control_point_that_shapes_it(low: float, high: float) -> None:
+    closed = line(24.0)[0].closed(np.arange(-9.0, 34.0, 3.0))
+    found = closed.stretch(low, high)
+    columns = closed.columns(closed.tables.evaluate(np.linspace(low, high, 500))[1])
+    assert set(found.tolist()) == set(columns.ravel().tolist())
+    assert (np.diff(found) % closed.size == 1).all()
+
+
 def test_a_closed_curve_is_scipy_s() -> None:
     closed = line(24.0)[0].closed(np.arange(-9.0, 34.0, 3.0))
     points = np.random.default_rng(0).normal(size=(8, 2))
