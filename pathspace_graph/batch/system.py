@@ -209,9 +209,9 @@ class BatchSystem:
     def _feet(self, state: State, rows: IntArray, points: Array) -> FootPoints:
         """Refine the foot points of used detections (m,) at points (m, 2)."""
         detections, curves = self.detections, state.curves
-        u, s = detections.u[rows], curves.boundaries[0].settings
+        u, s = detections.u[rows], next(iter(state.boundaries.values())).settings
         curve = curves.labels.searchsorted(detections.boundary[rows])
-        stretch = u, u - s.refine_room, np.minimum(u + s.refine_room, curves.trusted[curve])
+        stretch = u, u - s.refine_room, np.minimum(u + s.refine_room, state.trusted[curve])
         search = *stretch, s.refine_iterations
         return FootPoints(*curves.searched.refine(state.map_points, points, curve, *search))
 

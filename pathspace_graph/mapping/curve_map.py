@@ -74,7 +74,7 @@ class CurveMap:
         on = self.stations
         rows, u, self.reached_inactive, measured = kernels.curve_rows(
             curves.searched,
-            (state.map_points, curves.labels, curves.keys, curves.trusted, curves.active_from),
+            (state.map_points, curves.labels, curves.keys, state.trusted, curves.active_from),
             detections.associated,
             cycles,
             variables.poses,

@@ -7,6 +7,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from pathspace_graph.copies import shallow
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import rotated, to_map
@@ -202,14 +203,10 @@ class DetectionTable(DetectionColumns):
 
     def copy(self) -> Self:
         """Return an independent copy; columns that are only replaced are shared."""
-        return replace(
-            self,
-            changed=self.changed.copy(),
-            boundary=self.boundary.copy(),
-            u=self.u.copy(),
-            used=self.used.copy(),
-            station=self.station.copy(),
-        )
+        other = shallow(self)
+        for column in ("changed", "boundary", "u", "used", "station"):
+            vars(other)[column] = vars(self)[column].copy()
+        return other
 
     @property
     def associated(self) -> tuple[IntArray, IntArray, BoolArray, Array, Array, Array, Array, IntArray]:

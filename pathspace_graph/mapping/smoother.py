@@ -90,7 +90,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         pose_u = np.array([state.pose_u[label] for label in state.boundaries])
         seen_from = pose_u[curve, detections.cycle[rows] - self.first_cycle]
         stretch = seen_from - gate.view_behind, seen_from + gate.view_ahead
-        self._accept(rows, curve, points, state.curves.find(state.map_points, points, curve, *stretch))
+        self._accept(rows, curve, points, state.find(points, curve, *stretch))
 
     def _accept(self, rows: IntArray, curve: IntArray, points: Array, foot: FootPoints) -> Array:
         """Use detections (m,) that pass the gate of their curve (m,); return innovations (m,) in sigmas."""
@@ -114,7 +114,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
 
     def _untested(self, retest: frozenset[int]) -> tuple[IntArray, IntArray]:
         """Return the detections (m,) to test, and the index (m,) of the curve to test each for."""
-        detections, labels = self.map.detections, self.map.state.curves.labels
+        detections, labels = self.map.detections, np.array([*self.map.state.boundaries], np.intp)
         newest = int(detections.cycle.searchsorted(self.next_cycle - 1))
         since = np.array([0 if label in retest else newest for label in labels.tolist()], np.intp)
         return detections.open_to(labels, since)
@@ -140,7 +140,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         foot, beside = kernels.in_view(
             curves.searched,
             state.map_points,
-            curves.trusted,
+            state.trusted,
             points,
             curve,
             self.map.detections.cycle[rows] - self.first_cycle,
@@ -166,13 +166,14 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
 
     # --- the active part ---------------------------------------------------------------------------------
 
-    def deactivate_distant(self, spare: bool = True) -> None:
+    def deactivate_distant(self, spare: bool = True) -> bool:
         """Restrict steps to the control points that the window can reach, and some room for the next cycles.
 
         The active part of a closed map is chosen again when it does not contain what the window needs. The
         inactive part of an open map grows with the drive, where possible in a cycle with time to `spare`.
         Inactive control points keep their linearization point. From a map that is solved as a whole, a closed
-        one differs by millimetres to centimetres, an open one by decimetres.
+        one differs by millimetres to centimetres, an open one by decimetres. Return whether some became
+        inactive.
         """
         state = self.map.state
         needed = {label: self._needed(label) for label in state.boundaries}
@@ -183,15 +184,16 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
             keys = [state.control_keys(label)[indices] for label, indices in needed.items()]
             self.activate(np.concatenate(keys))
         elif not self._is_worthwhile(needed, FAR_STRETCH if spare else 2.0 * FAR_STRETCH):
-            return
+            return False
         active = {label: self._needed(label, FAR_ROOM) for label in state.boundaries}
         leaving = [np.setdiff1d(state.active(label), indices) for label, indices in active.items()]
         if not any(map(len, leaving)):
-            return
+            return False
         keys = [state.control_keys(label)[indices] for label, indices in zip(active, leaving, strict=True)]
         self.deactivate(np.concatenate(keys))
         state.activate_only(active)
         self.transform_to_origin()
+        return True
 
     def _is_worthwhile(self, needed: dict[int, IntArray], stretch: float) -> bool:
         """Whether a closed curve is active all around, or an open one for a stretch (m) behind."""

@@ -1,8 +1,7 @@
 """State of the spline estimators: curves, and the variables of control points and poses."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from operator import is_
 from typing import Any, Final, Self
 
@@ -44,10 +43,10 @@ NEGLIGIBLE: Final = 1e-6  # share of the largest derivative below which one is l
 class Curves:
     """The active parts of all curves; their control points are the rows of `State.map_points`."""
 
-    boundaries: tuple[Boundary, ...]
     labels: IntArray  # (k,) labels of the curves, ascending
     active: tuple[IntArray, ...]  # active control points of each curve, by index
     tables: tuple[SpanPolynomials, ...]  # bases of the whole curves
+    searched: kernels.Curves  # all of closed curves, and open ones from their first active control point on
     active_from: Array  # (k,) parameter before which an open curve is inactive; -inf if all is active
     keys: IntArray  # (m,) keys of all control points
 
@@ -55,28 +54,18 @@ class Curves:
     def of(cls, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> Self:
         """Lay out at least one boundary, with the active control points (k,) of each."""
         curves, active_of = tuple(boundaries.values()), tuple(active[label] for label in boundaries)
-        first = _first_active(curves, active_of)
-        begins = [_tail(b, start).low if start else -np.inf for b, start in zip(curves, first, strict=True)]
+        counts = [boundary.size for boundary in curves]
+        first = [0 if b.periodic else int(own[0]) for b, own in zip(curves, active_of, strict=True)]
+        bases = [b.tables.tail(start) if start else b.tables for b, start in zip(curves, first, strict=True)]
+        begins = [base.low if start else -np.inf for base, start in zip(bases, first, strict=True)]
         return cls(
-            boundaries=curves,
             labels=np.array(list(boundaries), np.intp),
             active=active_of,
             tables=tuple(boundary.tables for boundary in curves),
+            searched=kernels.Curves(bases, (np.cumsum([0, *counts[:-1]]) + first).tolist(), counts),
             active_from=np.array(begins),
             keys=np.concatenate([control_keys(label, b.numbers) for label, b in boundaries.items()]),
         )
-
-    @cached_property
-    def searched(self) -> kernels.Curves:
-        """Return all of closed curves, and open ones from their first active control point on."""
-        sizes = [boundary.size for boundary in self.boundaries]
-        first = _first_active(self.boundaries, self.active)
-        bases = [_tail(boundary, start) for boundary, start in zip(self.boundaries, first, strict=True)]
-        return kernels.Curves(bases, (np.cumsum([0, *sizes[:-1]]) + first).tolist(), sizes)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out the compiled curves, which are made again."""
-        return {name: value for name, value in vars(self).items() if name != "searched"}
 
     def is_of(self, boundaries: Mapping[int, Boundary], active: Mapping[int, IntArray]) -> bool:
         """Whether these are the curves of the boundaries with these active control points, by default all."""
@@ -84,32 +73,6 @@ class Curves:
         stretches = [active.get(label, boundary.everything) for label, boundary in boundaries.items()]
         known = *self.tables, *self.active
         return len(tables) == len(self.tables) and all(map(is_, (*tables, *stretches), known))
-
-    def on(self, boundaries: Mapping[int, Boundary]) -> Self:
-        """Return the same layout with copies of the boundaries."""
-        return replace(self, boundaries=tuple(boundaries.values()))
-
-    @property
-    def trusted(self) -> Array:
-        """Parameter (k,) of each curve up to which foot points are allowed."""
-        return np.array([boundary.trusted for boundary in self.boundaries])
-
-    def find(
-        self, control_points: Array, points: Array, curve: IntArray, low: Array, high: Array
-    ) -> FootPoints:
-        """Find the foot points of points (m, 2), each on its own curve (m,) and stretch [low, high]."""
-        s, high = self.boundaries[0].settings, np.minimum(high, self.trusted[curve])
-        search = (s.search_step, s.search_iterations)
-        return FootPoints(*self.searched.search(control_points, points, curve, low, high, *search))
-
-
-def _first_active(boundaries: Sequence[Boundary], active: Sequence[IntArray]) -> list[int]:
-    """First active control point of each boundary, by index; 0 if closed."""
-    return [0 if b.periodic else int(indices[0]) for b, indices in zip(boundaries, active, strict=True)]
-
-
-def _tail(boundary: Boundary, first: int) -> SpanPolynomials:
-    return boundary.tables.tail(first) if first else boundary.tables
 
 
 class State:
@@ -132,8 +95,11 @@ class State:
         other.boundaries = {label: shallow(boundary) for label, boundary in self.boundaries.items()}
         other.pose_u = self.pose_u.copy()
         other.active_stretch = self.active_stretch.copy()
-        other._curves = self._curves and self._curves.on(other.boundaries)
         return other
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the compiled curves, which are laid out again."""
+        return vars(self) | {"_curves": None}
 
     def control_keys(self, label: int) -> IntArray:
         """Keys (m,) of a boundary's control points."""
@@ -189,6 +155,17 @@ class State:
             active = {label: self.active(label) for label in self.boundaries}
             known = self._curves = Curves.of(self.boundaries, active)
         return known
+
+    @property
+    def trusted(self) -> Array:
+        """Parameter (k,) of each curve up to which foot points are allowed."""
+        return np.array([boundary.trusted for boundary in self.boundaries.values()])
+
+    def find(self, points: Array, curve: IntArray, low: Array, high: Array) -> FootPoints:
+        """Find the foot points of points (m, 2), each on its own curve (m,) and stretch [low, high]."""
+        s, high = next(iter(self.boundaries.values())).settings, np.minimum(high, self.trusted[curve])
+        search = (s.search_step, s.search_iterations)
+        return FootPoints(*self.curves.searched.search(self.map_points, points, curve, low, high, *search))
 
     def add_boundary(self, label: int, boundary: Boundary, control_points: Array) -> None:
         """Add a boundary with control points (m, 2)."""

@@ -28,7 +28,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ways
 
 
-def searched(finder: ReturnFinder, cycle: int, length: float, grown: frozenset[int] = frozenset()) -> None:
+def searched(finder: ReturnFinder, cycle: int, length: float, busy: bool = False) -> None:
     """Search on a road with a curve whose first 30 m count."""
     line = BSpline.open_uniform(np.column_stack([np.arange(9.0), np.zeros(9)]))
     smoother = SimpleNamespace(
@@ -47,7 +47,7 @@ def searched(finder: ReturnFinder, cycle: int, length: float, grown: frozenset[i
         "poses": [None],
         "boundaries": boundaries,
         "smoother": smoother,
-        "grown": grown,
+        "busy": busy,
     }
     finder.find(SimpleNamespace(**road, settings=None), record, None)  # type: ignore[arg-type]
 
@@ -69,9 +69,9 @@ def test_an_attempt_waits_for_some_metres_and_for_some_cycles_at_rest(tried: lis
     assert len(tried) == 2
     searched(finder, RETURN_CYCLES + 1, 100.0 + STEP)
     assert len(tried) == 3
-    searched(finder, RETURN_CYCLES + 2, 100.0 + 2.99 * STEP, grown=frozenset({0}))  # growth takes time, too
+    searched(finder, RETURN_CYCLES + 2, 100.0 + 2.99 * STEP, busy=True)
     assert len(tried) == 3
-    searched(finder, RETURN_CYCLES + 2, 100.0 + 3.0 * STEP, grown=frozenset({0}))
+    searched(finder, RETURN_CYCLES + 2, 100.0 + 3.0 * STEP, busy=True)
     assert len(tried) == 4
 
 

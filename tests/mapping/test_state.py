@@ -95,9 +95,9 @@ def test_foot_points_on_both_curves_are_those_on_each_alone(state: State) -> Non
     rng = np.random.default_rng(0)
     curve, u = rng.integers(0, 2, 20), rng.uniform(3.0, 35.0, 20)
     points = np.column_stack([u, rng.normal(size=20)])
-    found = state.curves.find(state.map_points, points, curve, u - 3.0, u + 3.0)
+    found = state.find(points, curve, u - 3.0, u + 3.0)
     room = SplineSettings().refine_room
-    stretch = u, u - room, np.minimum(u + room, state.curves.trusted[curve])
+    stretch = u, u - room, np.minimum(u + room, state.trusted[curve])
     refined = FootPoints(*state.curves.searched.refine(state.map_points, points, curve, *stretch, 1))
     for index, label in enumerate((LEFT, RIGHT)):
         own, boundary = curve == index, state.boundaries[label]
@@ -129,7 +129,7 @@ def test_the_extrapolated_end_is_no_part_of_a_stretch(state: State) -> None:
     trusted = state.boundaries[RIGHT].trusted
     assert trusted == 40.5
     points, curve, low = np.array([[20.0, -2.0], [99.0, -2.0]]), np.array([1, 1]), np.zeros(2)
-    foot = state.curves.find(state.map_points, points, curve, low, np.array([20.0, 99.0]))
+    foot = state.find(points, curve, low, np.array([20.0, 99.0]))
     np.testing.assert_allclose(foot.u, [20.0, trusted], atol=1e-9)
 
 
