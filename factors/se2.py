@@ -30,7 +30,7 @@ def rotation(theta: float) -> Array:
 def rotations(theta: Array) -> Array:
     """Rotation matrices R(theta) (m, 2, 2) of angles (m,)."""
     c, s = np.cos(theta), np.sin(theta)
-    return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+    return np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
 
 
 def rotated(covariances: Array, theta: Array) -> Array:

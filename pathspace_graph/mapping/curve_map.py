@@ -1,6 +1,7 @@
 """The curves for the engine: rows of detections and of new control points, also as GTSAM's own factors."""
 
 from collections.abc import Callable, MutableSequence
+from functools import reduce
 from itertools import starmap
 from typing import Any, Final, Self
 
@@ -85,8 +86,8 @@ class CurveMap:
             None if on is None else (on.value, on.slope, on.columns, on.sigma),
         )
         self._refined = rows, u
-        weak = (one.where(among(one.cycle, cycles)) for one in self.weak.values() if len(one.cycle))
-        return [*starmap(Rows, measured), *(own for one in weak for own in one.rows(variables))]
+        weak = [one.where(among(one.cycle, cycles)) for one in self.weak.values()]
+        return [*starmap(Rows, measured), *(reduce(WeakPriors.joined, weak).rows(variables) if weak else ())]
 
     def correct(self) -> None:
         """Do nothing: detections are corrected on access."""

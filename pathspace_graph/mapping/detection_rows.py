@@ -1,7 +1,7 @@
 """Rows of the curves: detections across and along them, and the weak priors of control points."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Self
 
@@ -266,10 +266,10 @@ class WeakPriors:
         )
 
     def where(self, chosen: BoolArray) -> Self:
-        return type(self)(*(getattr(self, column.name)[chosen] for column in fields(self)))
+        return type(self)(*(column[chosen] for column in vars(self).values()))
 
     def joined(self, other: Self) -> Self:
-        both = ((getattr(self, column.name), getattr(other, column.name)) for column in fields(self))
+        both = zip(vars(self).values(), vars(other).values(), strict=True)
         return type(self)(*map(np.concatenate, both))
 
     def rows(self, variables: Variables) -> list[Rows]:
