@@ -5,6 +5,7 @@ cones beside lap 1.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, Protocol
@@ -13,20 +14,19 @@ import gtsam
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE, accumulated
+from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import (
     compose,
     difference,
     path_lengths,
     relative,
     rotated,
-    rotations,
     to_map,
 )
 from pathspace_graph.front_end.front_end import JudgedLog
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import Elimination, linear_graph, solution
-from pathspace_graph.graph.rows import OdometryChain, Revisit, revisit_rows
+from pathspace_graph.graph.rows import Revisit, revisit_rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, Variables, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult, VehicleState
@@ -171,7 +171,9 @@ def aligned_odometry(
     ends = np.array([(one.earlier, one.later) for one in revisits], np.intp).reshape(-1, 2)
     _, regular = np.unique(path_lengths(poses) // NODE_STEP, return_index=True)
     nodes = np.unique(np.concatenate([regular, ends.ravel(), [len(poses) - 1]]))
-    between = thinned(chain, nodes)
+    odometry = copy(chain.odometry)
+    odometry.compose_between(nodes)
+    between = replace(chain, stamps=chain.stamps[nodes], odometry=odometry, twists=chain.twists[nodes])
     met = [
         replace(one, earlier=earlier, later=later)
         for one, (earlier, later) in zip(revisits, nodes.searchsorted(ends).tolist(), strict=True)
@@ -190,25 +192,6 @@ def aligned_odometry(
     last = nodes.searchsorted(np.arange(len(poses)), side="right") - 1
     poses = compose(variables.poses[last], relative(reckoned[nodes[last]], reckoned))
     return AlignedOdometry(poses, variables.calibration, nodes, graph, variables.layout)
-
-
-def thinned(chain: LogOdometry, cycles: IntArray) -> LogOdometry:
-    """Compose the odometry between some cycles (k,), the first and the last one among them, to one interval.
-
-    An error e_i of interval i, in the frame of its end, moves the end of the composition by
-    `Ad(T_end^-1 T_i) e_i`.
-    """
-    odometry, composed = chain.odometry, OdometryChain()
-    poses = accumulated(np.concatenate([np.zeros((1, POSE)), odometry.deltas]))
-    x, y, theta = relative(poses[np.repeat(cycles[1:], np.diff(cycles))], poses[1:]).T
-    adjoint = np.zeros((len(theta), POSE, POSE))
-    adjoint[:, :2, :2], adjoint[:, :, 2] = rotations(theta), np.column_stack([y, -x, np.ones(len(theta))])
-    root = adjoint @ np.linalg.inv(odometry.whiteners)
-    covariances = np.add.reduceat(root @ root.transpose(0, 2, 1), cycles[:-1])
-    composed.deltas = relative(poses[cycles[:-1]], poses[cycles[1:]])
-    composed.whiteners = np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)), np.float64)
-    composed.by_calibration = np.add.reduceat(adjoint @ odometry.by_calibration, cycles[:-1])
-    return replace(chain, stamps=chain.stamps[cycles], odometry=composed, twists=chain.twists[cycles])
 
 
 def all_detections(judged: JudgedLog) -> DetectionColumns:

@@ -163,7 +163,9 @@ class BatchSystem:
                 groups += chain.rows(poses, calibration)
                 continue
             own = [chain.odometry_rows(poses, calibration), *chain.calibration_priors(calibration)]
-            groups += [in_drive(rows, d, part.start) for rows in own]
+            for rows in own:  # numbered as those of a drive alone
+                keys = rows.keys + np.where(are_poses(rows.keys), part.start, d)
+                groups.append(replace(rows, keys=keys, owner=rows.owner + owners(np.array(part.start))))
         for number in range(len(variables.sensor) // SENSOR_SIZE):  # each by its first drive
             prior = self.priors[sensors.index(number)].calibration
             groups.append(sensor_prior(of_sensor(variables.sensor, number), prior, number))
@@ -258,12 +260,6 @@ class BatchSystem:
         groups = [(label, rows) for label, one in weak.items() for rows in one.rows(state.variables)]
         return [replace(rows, owner=owners(rows.owner, label)) for label, rows in groups]
 
-    def track(self, state: State) -> CurveMap:
-        """The curves of a state with the detections of the problem."""
-        track = CurveMap(self.settings, state)
-        track.detections, track.stations, track.weak = self.detections, self.stations, self.weak
-        return track
-
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
         """Linear graph of all rows; its solution is the change from the state."""
         return linear_graph(self.rows(at), at.state.variables)
@@ -297,12 +293,6 @@ class BatchSystem:
         return solution(graph, Layout(keys[are_poses(keys)]))
 
 
-def in_drive(rows: Rows, number: int, first_cycle: int) -> Rows:
-    """Renumber rows of a drive alone, by its number and first cycle among several drives."""
-    keys = rows.keys + np.where(are_poses(rows.keys), first_cycle, number)
-    return replace(rows, keys=keys, owner=rows.owner + owners(np.array(first_cycle)))
-
-
 def seen_after_step(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
     """Transform points (m, 2), map frame, to the frames of poses (m, 3) after a step, to first order."""
     arm, change = points - poses[:, :2], points_after - points - poses_after[:, :2] + poses[:, :2]
@@ -333,7 +323,8 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     drives.
     """
     factors, graph = [*drive_factors(system, at)], gtsam.NonlinearFactorGraph()
-    track = system.track(at.state)
+    track = CurveMap(system.settings, at.state)
+    track.detections, track.stations, track.weak = system.detections, system.stations, system.weak
     for label in at.state.boundaries:
         factors += curve_factors(track, label)
     for factor in factors:
@@ -435,22 +426,17 @@ class Optimizer:
         self._last_step: Array | None = None  # last step of the map and the calibration
 
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
-        """Find the optimum on curves with about one knot for each cone, which meet the cones."""
-        first, *others = self.schedule(state)
-        at, convergence = self.run(self.align_poses(state, first.gate), first)
-        for stage in others:
-            at, convergence = self.run(at.state, stage)
-        return at, convergence
+        """Find the optimum on curves with about one knot for each cone, which meet the cones.
 
-    def schedule(self, state: State) -> list[Stage]:
-        """Stages of the search; on closed curves, stations constrain the detections along them at the end."""
+        On closed curves, stations constrain the detections along them in the last stage.
+        """
         gate, rounds, rough = self.settings.gate, self.effort.rounds, self.effort.tolerance * ROUGH_TOLERANCE
         first_gate = gate if self.system.revisits else LOOSE_GATE
-        first = Stage(first_gate, self.effort.rough_rounds, rough, refit=True)
+        state = self.align_poses(state, first_gate)
+        at, _ = self.run(state, Stage(first_gate, self.effort.rough_rounds, rough, refit=True))
         curves = state.boundaries.values()
-        closed = bool(curves) and all(curve.periodic for curve in curves)
-        stations = self.system.settings.stations and closed
-        return [first, Stage(gate, rounds, self.effort.tolerance, refit=True, stations=stations)]
+        stations = self.system.settings.stations and bool(curves) and all(one.periodic for one in curves)
+        return self.run(at.state, Stage(gate, rounds, self.effort.tolerance, refit=True, stations=stations))
 
     def align_poses(self, state: State, gate: float) -> State:
         """Take one Gauss-Newton step of the poses alone, with fixed map and calibration."""

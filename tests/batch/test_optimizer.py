@@ -14,6 +14,7 @@ from pathspace_graph.batch.system import (
     LOOSE_GATE,
     TOLERANCE_DECREASE,
     BatchSystem,
+    Convergence,
     Evaluation,
     Optimizer,
     Stage,
@@ -40,9 +41,17 @@ def noisy() -> tuple[BatchSystem, State]:
     return drawn(exact, np.random.default_rng(3))[0], truth
 
 
-def test_the_schedule_of_open_curves_has_no_stations_and_ends_with_the_tight_gate() -> None:
+def test_open_curves_have_no_stations_and_end_with_the_tight_gate(monkeypatch: pytest.MonkeyPatch) -> None:
     system, state = noisy()
-    first, last = Optimizer(system).schedule(state)
+    stages, run = list[Stage](), Optimizer.run
+
+    def noted(optimizer: Optimizer, state: State, stage: Stage) -> tuple[Evaluation, Convergence]:
+        stages.append(stage)
+        return run(optimizer, state, stage)
+
+    monkeypatch.setattr(Optimizer, "run", noted)
+    Optimizer(system).find(state)
+    first, last = stages
     assert (first.gate, first.refit, last.gate, last.refit) == (LOOSE_GATE, True, BATCH.gate, True)
     assert first.tolerance > last.tolerance
     assert not (first.stations or last.stations)
