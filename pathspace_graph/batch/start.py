@@ -45,9 +45,8 @@ from .association import ROW_CONES, add_drive, cluster
 from .simplification import boundary_of, exact_settings, fit_through
 from .system import BatchSystem
 
-ALIGN_STEPS: Final = 8  # largest number of Gauss-Newton steps that align the passes of a place
 NODE_STEP: Final = 5.0  # distance of the nodes, whose poses are aligned (m along the path)
-ALIGN_TOLERANCE: Final = 1.0  # largest change in the last of these steps (m), a sigma of `NEARBY`
+ALIGN_TOLERANCE: Final = 1.0  # largest change in the last Gauss-Newton step (m), a sigma of `NEARBY`
 OFF: Final = 0.3  # largest misfit of a revisit (sigmas of `NEARBY`) without a new alignment
 REVISIT_INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
 LAP_SHARE: Final = 0.7  # least share of a lap between two passes
@@ -181,7 +180,7 @@ def aligned_odometry(
     variables = Variables()
     variables.insert(np.array([CALIBRATION_KEY]), calibration)
     variables.insert(pose_keys(np.arange(len(nodes))), poses[nodes].ravel())
-    for _ in range(ALIGN_STEPS):
+    for _ in range(8):
         rows = between.rows(variables.poses, variables.calibration) + revisit_rows(met, variables.poses)
         graph = linear_graph(rows, variables)
         step = solution(graph, variables.layout)

@@ -375,7 +375,6 @@ GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down
 CHANGED_SHARE: Final = 1e-3  # largest share of detections that change in the last round of associations
 TOLERANCE_DECREASE: Final = 0.05  # largest predicted decrease of the cost in the last step; one sigma is 1/2
 ROUGH_TOLERANCE: Final = 100.0  # factor of the tolerance while knots or stations still change
-HALVINGS: Final = 8  # number of lengths of a step that are tried, each half of the one before
 CREEP_SHARES: Final = (0.3, 0.97)  # ratio of a step to the last one between which it is extrapolated
 
 
@@ -491,7 +490,7 @@ class Optimizer:
         rows = system.rows(at)
         step = solution(linear_graph(rows, state.variables), layout)
         decrease, before, self._last_step = predicted_decrease(rows, layout, step), self._last_step, None
-        for share in 0.5 ** np.arange(HALVINGS):
+        for share in 0.5 ** np.arange(8):
             self.steps += 1
             trial = system.evaluate(system.retract(state, share * step))
             if trial.cost <= cost:
