@@ -68,7 +68,12 @@ def inverse(pose: Array) -> Array:
 
 
 def relative(pose: Array, other: Array) -> Array:
-    """Relative pose `pose^-1 * other` (3,) on SE(2); its heading is not wrapped."""
+    """Relative pose `pose^-1 * other` on SE(2), for one pose (3,) or row by row (k, 3).
+
+    Headings are not wrapped.
+    """
+    if pose.ndim == 2:
+        return np.column_stack([to_vehicle(other[:, :2], pose), other[:, 2] - pose[:, 2]])
     return np.append(rotation(pose[2]).T @ (other[:2] - pose[:2]), other[2] - pose[2])
 
 

@@ -273,7 +273,7 @@ class LandmarkSystem:
 
     def optimize(self, state: LandmarkState) -> None:
         """Optimize a state by Levenberg-Marquardt with fixed associations; landmarks are damped (1/m^2)."""
-        variables, cost, damping = state.variables, self.cost(state), elimination.Damping()
+        variables, cost, damping = state.variables, self.cost(state), 1e-2
         keys = np.repeat(state.keys, POINT)[:, None]
         still = Rows(
             keys,
@@ -282,18 +282,18 @@ class LandmarkSystem:
             -1 - np.arange(len(keys)) // POINT,
         )
         for _ in range(80):
-            damped = replace(still, jacobian=np.sqrt(damping.weight) * still.jacobian)
+            damped = replace(still, jacobian=np.sqrt(damping) * still.jacobian)
             rows, before = self.rows(state, self.settings.gate.huber), variables.values
             graph = elimination.linear_graph([*rows, damped], variables)
             variables.values = before + elimination.solution(graph, variables.layout)
             gain = cost - self.cost(state)
             if gain < 0.0:
                 variables.values = before
-                damping.grow()
+                damping *= 5.0
             else:
                 cost -= gain
-                damping.lower()
-            if damping.exhausted or 0.0 <= gain <= 1e-6 * cost:
+                damping = max(0.1 * damping, 1e-6)
+            if damping > 1e6 or 0.0 <= gain <= 1e-6 * cost:
                 break
         self.detections.correct(variables.sensor)
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -69,14 +68,19 @@ def locate_poses(state: State) -> None:
     A vehicle faces along the road, or moves along it while it spins. The parameter increases from lap to lap
     on a closed curve. On an open curve, which may have drifted over itself, it follows the driven path.
     """
-    poses = state.poses
+    poses, heads = state.poses, headings(state.poses)
     courses = np.concatenate([courses_of(poses[part]) for part in state.drives.parts(len(poses))])
     for label, boundary in state.boundaries.items():
         count = int(np.ceil(boundary.length / POSE_STEP))
         u = boundary.tables.low + boundary.length * (np.arange(count) + 0.5) / count
         position, tangent = (boundary.evaluate(state.control_points(label), u, order) for order in (0, 1))
         tangent /= np.maximum(np.hypot(*tangent.T), np.finfo(float).tiny)[:, None]
-        against = partial(_against, (headings(poses), courses), tangent)
+
+        def against(i: IntArray, j: IntArray, tangent: Array = tangent) -> Array:
+            """Penalty (m^2) of samples j of the curve that run along neither of the ways of poses i."""
+            alike = ((way[i] * tangent[j]).sum(axis=-1) for way in (heads, courses))
+            return np.where(np.maximum(*alike) < SAME_DIRECTION, DIRECTION_PENALTY**2, 0.0)
+
         if boundary.periodic:
             near = nearest_by(poses[:, :2], position, against)
             state.pose_u[label] = _from_lap_to_lap(u[near], boundary.length, state.drives)
@@ -86,12 +90,6 @@ def locate_poses(state: State) -> None:
             driven = np.hypot(*np.diff(poses[:, :2], axis=0).T) + POSE_ROOM
             driven[state.drives.begins(len(poses))] = boundary.length
             state.pose_u[label] = u[_along(square, driven * count / boundary.length)]
-
-
-def _against(ways: tuple[Array, Array], tangent: Array, i: IntArray, j: IntArray) -> Array:
-    """Return the penalty (m^2) of samples j of a curve that run along neither of the ways of poses i."""
-    alike = [(way[i] * tangent[j]).sum(axis=-1) for way in ways]
-    return np.where(np.maximum(*alike) < SAME_DIRECTION, DIRECTION_PENALTY**2, 0.0)
 
 
 Penalty = Callable[[IntArray, IntArray], Array]

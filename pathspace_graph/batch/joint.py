@@ -40,7 +40,7 @@ from pathspace_graph.settings.mapper import MapperSettings, Start, known_setting
 
 from .association import locate_poses
 from .lap import disagreement
-from .mapper import BatchMapper, BatchResult, Found, frame_of_drive, map_of, result_of, with_wider_priors
+from .mapper import BatchMapper, BatchResult, Found, frame_of_drive, results_of, with_wider_priors
 from .simplification import boundary_of
 from .start import REVISIT_INTERVAL
 from .system import BatchSystem, Optimizer
@@ -133,14 +133,6 @@ def revisits_between(system: BatchSystem, state: State) -> list[Revisit]:
             if again is not None:
                 found.append(revisit_of(again[0], poses, again[1], newest))
     return found
-
-
-def disagreement_of(placed: PlacedDrive, number: int, state: State) -> str:
-    """Describe how the poses of a drive contradict its odometry; empty if they agree."""
-    poses = state.poses[state.drives.parts(len(state.poses))[number]]
-    back = compose(placed.state.poses[0], inverse(poses[0]))
-    calibration = state.variables.calibration.reshape(-1, CALIBRATION_SIZE)[number]
-    return disagreement(placed.alone.system, compose(back, poses), calibration)
 
 
 # --- the place of a drive --------------------------------------------------------------------------------
@@ -271,37 +263,56 @@ def join(
 ) -> JointResult:
     """Solve one map of drives that were solved alone, at one scale.
 
-    Drives of one vehicle, if its name is known, share the calibration of the sensor.
+    Drives of one vehicle, if its name is known, share the calibration of the sensor. Drives without a sure
+    place on the map of the base, and those that contradict the optimum, are left out.
     """
-    scale, watch = next(iter(alone.values())).scale, Stopwatch()
+    scale, vehicles, watch = next(iter(alone.values())).scale, vehicles or {}, Stopwatch()
     with threadpool_limits(limits=1), solving("the joint batch"):
-        placed, left_out = place_all(alone, vehicles or {})
+        known = base_of(alone)
+        motions, left_out = {known: np.zeros(3)}, dict[str, str]()
+        for name, result in alone.items():
+            try:
+                if name != known:
+                    motions[name] = find_place(driven(alone[known]), driven(result))
+            except NotPlacedError as error:
+                left_out[name] = str(error)
+        names = [name for name in alone if name in motions]
+        back = inverse(motions[names[0]])
+        placed = [
+            PlacedDrive(name, alone[name], compose(back, motions[name]), vehicles.get(name, ""))
+            for name in names
+        ]
         watch.lap("place")
-        joint = _Joint(placed, on_round, watch)
-        joint.solve()
-        result = joint.result(scale)
-    return replace(result, left_out=left_out | joint.left_out)
-
-
-def place_all(
-    alone: Mapping[str, BatchResult], vehicles: Mapping[str, str]
-) -> tuple[list[PlacedDrive], dict[str, str]]:
-    """Place drives on the map of the base; return them, and by name why others do not fit."""
-    known = base_of(alone)
-    motions, left_out = {known: np.zeros(3)}, dict[str, str]()
-    for name, one in alone.items():
-        if name == known:
-            continue
-        try:
-            motions[name] = find_place(driven(alone[known]), driven(one))
-        except NotPlacedError as error:
-            left_out[name] = str(error)
-    names = [name for name in alone if name in motions]
-    back = inverse(motions[names[0]])
-    placed = [
-        PlacedDrive(name, alone[name], compose(back, motions[name]), vehicles.get(name, "")) for name in names
-    ]
-    return placed, left_out
+        while True:
+            base = base_of({one.name: one.alone for one in placed})
+            system = joint_system(placed)
+            state = joint_state(placed, next(one for one in placed if one.name == base))
+            system.revisits += tuple(revisits_between(system, state))
+            optimizer = Optimizer(system, on_round=on_round)
+            found = Found(optimizer, *optimizer.find(state))
+            contradicted = dict[str, str]()
+            for d, (one, part) in enumerate(zip(placed, state.drives.parts(len(state.poses)), strict=True)):
+                poses, variables = found.at.state.poses[part], found.at.state.variables
+                to_own = compose(one.state.poses[0], inverse(poses[0]))
+                calibration = variables.calibration.reshape(-1, CALIBRATION_SIZE)[d]
+                if why := disagreement(one.alone.system, compose(to_own, poses), calibration):
+                    contradicted[one.name] = why
+            if not contradicted or len(contradicted) == len(placed):
+                break
+            left_out |= contradicted
+            placed = [one for one in placed if one.name not in contradicted]
+        found, known_system = with_wider_priors(found)
+        watch.lap("optimum")
+        orange = dict[int, PointBoundary]()  # of the first drive that has some of a label
+        for one in placed:
+            own = scaled(one.alone.map, 1.0 / one.alone.scale).moved(one.motion).points
+            orange = {**own, **orange}
+        origins = [(one.alone.settings, one.alone.noise) for one in placed]
+        drives, frames = dict[str, BatchResult](), dict[str, Array]()
+        for one, result in zip(placed, results_of(found, known_system, origins, orange, watch), strict=True):
+            drives[one.name] = scaled(result, scale)
+            frames[one.name] = frame_of_drive(one.chain, result.trajectory) * [scale, scale, 1.0]
+    return JointResult(drives, frames, left_out)
 
 
 def base_of(alone: Mapping[str, BatchResult]) -> str:
@@ -312,58 +323,3 @@ def base_of(alone: Mapping[str, BatchResult]) -> str:
 
 def driven(result: BatchResult) -> Driven:
     return Driven(result.optimum.state, result.system.detections, result.system.settings)
-
-
-class _Joint:
-    """Search for the optimum of all drives; drives that contradict it are left out."""
-
-    def __init__(
-        self, placed: Sequence[PlacedDrive], on_round: Callable[[], None] | None, watch: Stopwatch
-    ) -> None:
-        self.placed, self.left_out = list(placed), dict[str, str]()
-        self._on_round, self._watch = on_round, watch
-
-    def solve(self) -> None:
-        """Search the optimum, again without drives that contradict it."""
-        base = base_of({one.name: one.alone for one in self.placed})
-        system = joint_system(self.placed)
-        state = joint_state(self.placed, next(one for one in self.placed if one.name == base))
-        system.revisits += tuple(revisits_between(system, state))
-        optimizer = Optimizer(system, on_round=self._on_round)
-        found = Found(optimizer, *optimizer.find(state))
-        why = {one.name: disagreement_of(one, d, found.at.state) for d, one in enumerate(self.placed)}
-        wrong = {name: reason for name, reason in why.items() if reason}
-        if wrong and len(wrong) < len(self.placed):
-            self.left_out |= wrong
-            self.placed = [one for one in self.placed if one.name not in wrong]
-            self.solve()
-            return
-        self.found, self.known = with_wider_priors(found)
-        self._watch.lap("optimum")
-
-    def result(self, scale: float) -> JointResult:
-        """Return the result in metres of the logs, whose scene has a scale."""
-        track = map_of(self.found, self.known, self._orange(), self._watch)
-        drives, frames = dict[str, BatchResult](), dict[str, Array]()
-        for d, one in enumerate(self.placed):
-            drive = result_of(
-                self.found,
-                self.known,
-                track,
-                settings=one.alone.settings,
-                noise=one.alone.noise,
-                chain=one.chain,
-                seconds=self._watch.laps,
-                drive=d,
-            )
-            drives[one.name] = scaled(drive, scale)
-            frames[one.name] = frame_of_drive(one.chain, drive.trajectory) * [scale, scale, 1.0]
-        return JointResult(drives, frames, {})
-
-    def _orange(self) -> dict[int, PointBoundary]:
-        """Return the orange cones of the first drive that has some of a label, by label."""
-        found = dict[int, PointBoundary]()
-        for one in self.placed:
-            own = scaled(one.alone.map, 1.0 / one.alone.scale).moved(one.motion).points
-            found = {**own, **found}
-        return found

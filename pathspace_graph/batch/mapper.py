@@ -13,7 +13,7 @@ from pathspace_graph.errors import SettingsError, SolveError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise
 from pathspace_graph.factors.se2 import compose, inverse
-from pathspace_graph.front_end.front_end import JudgedLog, judge_log
+from pathspace_graph.front_end.front_end import judge_log
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import eliminated_system
 from pathspace_graph.graph.exchange import pose_graph
@@ -36,13 +36,12 @@ from pathspace_graph.laps import LapCounter
 from pathspace_graph.lengths import POSE_LENGTHS
 from pathspace_graph.mapping.detections import DetectionTable
 from pathspace_graph.mapping.motion import known_noise, vehicle_of, with_inflated_priors, with_size
-from pathspace_graph.mapping.state import State
 from pathspace_graph.mapping.tracks import OrangeDetections, orange_cones
 from pathspace_graph.run import Stopwatch, settings_dict, solved
 from pathspace_graph.settings.mapper import MapperSettings, Start, known_settings
 
 from .lap import evidence_against, unmapped
-from .simplification import Scatter, Simplified, map_block, own_settings, simplified
+from .simplification import Scatter, map_block, own_settings, simplified
 from .start import CurveMapper, find_revisits, start_odometry, start_online
 from .system import (
     BatchSystem,
@@ -208,7 +207,8 @@ class BatchMapper:
         if start != "online":
             begun = find_closed_optimum(optimizer_with(revisits))
         if begun is None and start == "odometry":
-            begun = find_from_odometry(optimizer_with(()))
+            optimizer = optimizer_with(())
+            begun = Found(optimizer, *optimizer.find(start_odometry(optimizer.system)))
         if begun is None:
             if self.online is None:
                 raise SettingsError("start online: expected an online mapper, found none")
@@ -223,22 +223,12 @@ class BatchMapper:
                 begun = Found(optimizer, *optimizer.find(state))
         found, known = with_wider_priors(begun)
         watch.lap("optimum")
-        solved_map = map_of(found, known, _orange(judged, found.at.state), watch)
-        return result_of(
-            found,
-            known,
-            solved_map,
-            settings=settings_dict(settings),
-            noise=judged.noise,
-            chain=judged.chain,
-            online=online,
-            seconds=watch.laps,
-        )
-
-
-def find_from_odometry(optimizer: Optimizer) -> Found:
-    """Search the optimum from odometry and revisits."""
-    return Found(optimizer, *optimizer.find(start_odometry(optimizer.system)))
+        seen = OrangeDetections.of(judged.orange, twists=judged.chain.twists)
+        seen.place(0, found.at.state.poses)
+        own = judged.settings
+        orange = orange_cones(seen, found.at.state.variables.sensor, own.growth, own.spline.sigma_shape)
+        drives = [(settings_dict(settings), judged.noise)]
+        return replace(results_of(found, known, drives, orange, watch)[0], online=online)
 
 
 def find_closed_optimum(optimizer: Optimizer) -> Found | None:
@@ -250,7 +240,7 @@ def find_closed_optimum(optimizer: Optimizer) -> Found | None:
     if not system.revisits:
         return None
     try:
-        found = find_from_odometry(optimizer)
+        found = Found(optimizer, *optimizer.find(start_odometry(system)))
     except SolveError:
         return None
     against = evidence_against(system, found.at, found.at.state.splines, system.detections)
@@ -276,73 +266,77 @@ def with_wider_priors(found: Found) -> tuple[Found, FactoredSystem]:
 # --- the parts of a result -------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class SolvedMap:
-    """The map of an optimum."""
-
-    few: Simplified
-    joint: Array  # (n, n) covariance of the control points, without the scatter of the cones (m^2)
-    map: Map
-
-
-def map_of(
-    found: Found, known: FactoredSystem, orange: Mapping[int, PointBoundary], watch: Stopwatch
-) -> SolvedMap:
-    """Simplify the curves of an optimum, and propagate their covariance."""
-    state, settings = found.at.state, found.system.settings
-    points, size = state.map_points.ravel(), settings.odometry.sigma_size
-    joint = with_size(known.covariance(state.map_keys), points, size)
-    watch.lap("covariance")
-    few = simplified(state, found.system.detections, settings)
-    joint = few.change @ joint @ few.change.T
-    watch.lap("simplify")
-    return SolvedMap(few, joint, replace(_map_of_curves(few, joint, settings), points=dict(orange)))
-
-
-def result_of(
+def results_of(
     found: Found,
     known: FactoredSystem,
-    solved_map: SolvedMap,
-    *,
-    settings: dict[str, Any],
-    noise: RunNoise | None,
-    chain: LogOdometry,
-    seconds: dict[str, float],
-    online: RunResult | None = None,
-    drive: int = 0,
-) -> BatchResult:
-    """Return the result of one drive; `seconds` are the wall times of all of them together."""
-    state, few, convergence = found.at.state, solved_map.few, found.convergence
-    parts = state.drives.parts(len(state.poses))
-    poses, own = state.poses[parts[drive]].copy(), few.detections.of_drive(drive)
-    records, laps = records_of(few, chain, sum(seconds.values()) / len(parts), drive)
-    last, keys = parts[drive].stop - 1, state.calibration_keys(drive)
-    covariance = known.covariance(np.append(pose_key(last), keys))
-    size = found.system.settings.odometry.sigma_size
-    vehicle = vehicle_of(state.poses[last], state.variables.of(keys), covariance, size)
-    return BatchResult(
-        estimator=NAME,
-        settings=settings,
-        map=solved_map.map,
-        scatter=few.scatter,
-        trajectory_t=chain.stamps,
-        trajectory=poses,
-        cycles=records,
-        laps=laps,
-        converged=convergence.converged,
-        cost=convergence.cost,
-        convergence=convergence,
-        map_covariance=solved_map.joint,
-        calibration=vehicle.calibration,
-        noise=noise,
-        vehicle=vehicle,
-        online=online,
-        seconds=seconds,
-        system=found.system,
-        optimum=found.at,
-        objection=unmapped(replace(own, cycle=own.cycle - parts[drive].start), poses),
-        drive=drive,
-    )
+    drives: Sequence[tuple[dict[str, Any], RunNoise | None]],
+    orange: Mapping[int, PointBoundary],
+    watch: Stopwatch,
+) -> list[BatchResult]:
+    """Simplify the curves of an optimum, and return the result of each drive, given its settings and noise.
+
+    All have the same map, and the wall times of all drives together. `known` is that of `known_of`.
+    """
+    state, system, settings = found.at.state, found.system, found.system.settings
+    size = settings.odometry.sigma_size
+    joint = with_size(known.covariance(state.map_keys), state.map_points.ravel(), size)
+    watch.lap("covariance")
+    few = simplified(state, system.detections, settings)
+    joint = few.change @ joint @ few.change.T
+    watch.lap("simplify")
+    boundaries, counts = dict[int, SplineBoundary](), {LEFT: 0, RIGHT: 0}
+    for label, boundary in few.state.boundaries.items():
+        block, counts[label] = map_block(few.state, label), boundary.size
+        sigma = np.repeat(few.scatter.of_control_points(label, boundary), 2)
+        has_cones = state.closed and not settings.of_lines
+        u = few.scatter.places[label] if has_cones else np.zeros(0)
+        cones = np.column_stack([u, np.full(len(u), settings.spline.sigma_shape)])
+        covariance = joint[block, block] + np.diag(sigma**2)
+        boundaries[label] = SplineBoundary(few.state.spline(label), covariance, cones=cones)
+    track = Map(state.closed, boundaries, joint_covariance(joint, boundaries), points=dict(orange))
+    results, parts = list[BatchResult](), state.drives.parts(len(state.poses))
+    for drive, ((entries, noise), part) in enumerate(zip(drives, parts, strict=True)):
+        poses, detections, chain = state.poses[part].copy(), few.detections, system.chains[drive]
+        # count laps from the start of the drive
+        driven = compose(inverse(frame_of_drive(chain, poses)), poses) if drive > 0 else poses
+        used, offered = (
+            np.bincount(cycles, minlength=part.stop)[part].tolist()
+            for cycles in (detections.cycle[detections.used], detections.cycle)
+        )
+        counter, share = LapCounter(), sum(watch.laps.values()) / len(parts) / len(chain)
+        sizes = counts[LEFT], counts[RIGHT]
+        records = tuple(
+            CycleRecord(k, t, share, *sizes, used[k], counter.update(driven[k]), offered=offered[k])
+            for k, t in enumerate(chain.stamps.tolist())
+        )
+        keys, own = state.calibration_keys(drive), detections.of_drive(drive)
+        covariance = known.covariance(np.append(pose_key(part.stop - 1), keys))
+        vehicle = vehicle_of(poses[-1], state.variables.of(keys), covariance, size)
+        result = BatchResult(
+            estimator=NAME,
+            settings=entries,
+            map=track,
+            scatter=few.scatter,
+            trajectory_t=chain.stamps,
+            trajectory=poses,
+            cycles=records,
+            laps=counter.completed,
+            converged=found.convergence.converged,
+            cost=found.convergence.cost,
+            convergence=found.convergence,
+            map_covariance=joint,
+            calibration=vehicle.calibration,
+            noise=noise,
+            vehicle=vehicle,
+            online=None,
+            seconds=watch.laps,
+            system=system,
+            optimum=found.at,
+            objection=unmapped(replace(own, cycle=own.cycle - part.start), poses),
+            drive=drive,
+        )
+        results.append(result)
+    return results
 
 
 def known_of(system: BatchSystem, at: Evaluation) -> FactoredSystem:
@@ -351,45 +345,6 @@ def known_of(system: BatchSystem, at: Evaluation) -> FactoredSystem:
     last = [pose_key(part.stop - 1) for part in state.drives.parts(len(state.poses))]
     kept = Layout(keys[~are_poses(keys) | np.isin(keys, last)])
     return FactoredSystem(kept, cholesky(eliminated_system(system.linear_graph(at), kept)[0]))
-
-
-def _map_of_curves(few: Simplified, joint: Array, settings: MapperSettings) -> Map:
-    """Return the curves with their cones, and their covariance plus the scatter of the cones."""
-    state, boundaries = few.state, {}
-    has_cones = state.closed and not settings.of_lines
-    for label, boundary in state.boundaries.items():
-        block = map_block(state, label)
-        sigma = np.repeat(few.scatter.of_control_points(label, boundary), 2)
-        covariance = joint[block, block] + np.diag(sigma**2)
-        u = few.scatter.places[label] if has_cones else np.zeros(0)
-        cones = np.column_stack([u, np.full(len(u), settings.spline.sigma_shape)])
-        boundaries[label] = SplineBoundary(state.spline(label), covariance, cones=cones)
-    return Map(state.closed, boundaries, joint_covariance(joint, boundaries))
-
-
-def _orange(judged: JudgedLog, state: State) -> dict[int, PointBoundary]:
-    settings, seen = judged.settings, OrangeDetections.of(judged.orange, twists=judged.chain.twists)
-    seen.place(0, state.poses)
-    return orange_cones(seen, state.variables.sensor, settings.growth, settings.spline.sigma_shape)
-
-
-def records_of(
-    few: Simplified, chain: LogOdometry, seconds: float, drive: int
-) -> tuple[tuple[CycleRecord, ...], int]:
-    """Return a record of each cycle of a drive, with its share of the seconds, and the complete laps."""
-    state, detections = few.state, few.detections
-    part = state.drives.parts(len(state.poses))[drive]
-    left, right = (state.boundaries[b].size if b in state.boundaries else 0 for b in (LEFT, RIGHT))
-    used = np.bincount(detections.cycle[detections.used], minlength=part.stop)[part].tolist()
-    offered = np.bincount(detections.cycle, minlength=part.stop)[part].tolist()
-    poses, counter, share = state.poses[part], LapCounter(), seconds / len(chain)
-    if drive > 0:  # count laps from the start of the drive
-        poses = compose(inverse(frame_of_drive(chain, poses)), poses)
-    records = tuple(
-        CycleRecord(k, t, share, left, right, used[k], counter.update(poses[k]), offered=offered[k])
-        for k, t in enumerate(chain.stamps.tolist())
-    )
-    return records, counter.completed
 
 
 def frame_of_drive(chain: LogOdometry, poses: Array) -> Array:

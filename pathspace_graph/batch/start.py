@@ -5,6 +5,7 @@ cones beside lap 1.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, Protocol
@@ -12,14 +13,21 @@ from typing import Final, Protocol
 import gtsam
 import numpy as np
 
-from pathspace_graph.factors.arrays import Array
+from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.odometry import CALIBRATION_SIZE
-from pathspace_graph.factors.se2 import difference, path_lengths, relative, rotated, to_map
+from pathspace_graph.factors.se2 import (
+    compose,
+    difference,
+    path_lengths,
+    relative,
+    rotated,
+    to_map,
+)
 from pathspace_graph.front_end.front_end import JudgedLog
 from pathspace_graph.front_end.log_odometry import LogOdometry
 from pathspace_graph.graph.elimination import Elimination, linear_graph, solution
 from pathspace_graph.graph.rows import Revisit, revisit_rows
-from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Variables, pose_keys
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, Layout, Variables, pose_keys
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.results import RunResult, VehicleState
 from pathspace_graph.labels import BOUNDARIES
@@ -37,8 +45,8 @@ from .association import ROW_CONES, add_drive, cluster
 from .simplification import boundary_of, exact_settings, fit_through
 from .system import BatchSystem
 
-ALIGN_STEPS: Final = 8  # largest number of Gauss-Newton steps that align the passes of a place
-ALIGN_TOLERANCE: Final = 0.1  # largest change in the last of these steps (m, rad)
+NODE_STEP: Final = 5.0  # distance of the nodes, whose poses are aligned (m along the path)
+ALIGN_TOLERANCE: Final = 1.0  # largest change in the last Gauss-Newton step (m), a sigma of `NEARBY`
 OFF: Final = 0.3  # largest misfit of a revisit (sigmas of `NEARBY`) without a new alignment
 REVISIT_INTERVAL: Final = 15.0  # least distance from one revisit to the next (m along the path)
 LAP_SHARE: Final = 0.7  # least share of a lap between two passes
@@ -130,35 +138,22 @@ def length_of_lap(poses: Array, revisit: Revisit) -> float:
 
 @dataclass(frozen=True, eq=False)
 class AlignedOdometry:
-    """The optimum of odometry and revisits, without curves."""
+    """The optimum of odometry and revisits, without curves. Poses at nodes are variables."""
 
-    chain: LogOdometry
-    revisits: Sequence[Revisit]
-    variables: Variables  # at the optimum
-
-    @property
-    def poses(self) -> Array:
-        """Poses (P, 3) of all cycles."""
-        return self.variables.poses
-
-    @property
-    def calibration(self) -> Array:
-        """Calibration (2,) of the odometry."""
-        return self.variables.calibration
+    poses: Array  # (P, 3) poses of all cycles, dead reckoned from the last node
+    calibration: Array  # (2,) calibration of the odometry
+    nodes: IntArray  # (k,) cycles of the nodes, the first and the last cycle among them
+    graph: gtsam.GaussianFactorGraph  # as linearized in the last step; pose j is the one of node j
+    layout: Layout
 
     @cached_property
     def covariances(self) -> Array:
-        """Marginal covariance (P, 3, 3) of each pose."""
-        return Elimination(self.linear_graph(), self.variables.layout).pose_marginals
-
-    def linear_graph(self) -> gtsam.GaussianFactorGraph:
-        """Linearize the problem at the present values."""
-        rows = self.chain.rows(self.poses, self.calibration) + revisit_rows(self.revisits, self.poses)
-        return linear_graph(rows, self.variables)
+        """Marginal covariance (k, 3, 3) of each node."""
+        return Elimination(self.graph, self.layout).pose_marginals
 
     def disagreement(self, poses: Array) -> float:
-        """Root mean square distance of poses (P, 3) from these, in standard deviations."""
-        off = poses - self.poses
+        """Root mean square distance of poses (P, 3) from the nodes, in standard deviations."""
+        off = (poses - self.poses)[self.nodes]
         square = np.einsum("ki,ki->k", off, np.linalg.solve(self.covariances, off[:, :, None])[:, :, 0])
         return float(np.sqrt(square.mean() / POSE))
 
@@ -166,20 +161,36 @@ class AlignedOdometry:
 def aligned_odometry(
     chain: LogOdometry, revisits: Sequence[Revisit], begin: AlignedOdometry | None = None
 ) -> AlignedOdometry:
-    """Find the optimum of odometry and revisits by Gauss-Newton, from another one or dead reckoning."""
-    if begin is None:
-        variables, poses = Variables(), chain.dead_reckoned(chain.calibration_mean)
-        variables.insert(np.array([CALIBRATION_KEY]), chain.calibration_mean)
-        variables.insert(pose_keys(np.arange(len(poses))), poses.ravel())
-    else:
-        variables = begin.variables.copy()
-    aligned = AlignedOdometry(chain, revisits, variables)
-    for _ in range(ALIGN_STEPS):
-        step = solution(aligned.linear_graph(), variables.layout)
+    """Find the optimum of odometry and revisits by Gauss-Newton, from another one or dead reckoning.
+
+    The ends of revisits are nodes. The odometry between nodes is one factor.
+    """
+    calibration = chain.calibration_mean if begin is None else begin.calibration
+    poses = chain.dead_reckoned(calibration) if begin is None else begin.poses
+    ends = np.array([(one.earlier, one.later) for one in revisits], np.intp).reshape(-1, 2)
+    _, regular = np.unique(path_lengths(poses) // NODE_STEP, return_index=True)
+    nodes = np.unique(np.concatenate([regular, ends.ravel(), [len(poses) - 1]]))
+    odometry = copy(chain.odometry)
+    odometry.compose_between(nodes)
+    between = replace(chain, stamps=chain.stamps[nodes], odometry=odometry, twists=chain.twists[nodes])
+    met = [
+        replace(one, earlier=earlier, later=later)
+        for one, (earlier, later) in zip(revisits, nodes.searchsorted(ends).tolist(), strict=True)
+    ]
+    variables = Variables()
+    variables.insert(np.array([CALIBRATION_KEY]), calibration)
+    variables.insert(pose_keys(np.arange(len(nodes))), poses[nodes].ravel())
+    for _ in range(8):
+        rows = between.rows(variables.poses, variables.calibration) + revisit_rows(met, variables.poses)
+        graph = linear_graph(rows, variables)
+        step = solution(graph, variables.layout)
         variables.values = variables.values + step
         if np.abs(step).max() < ALIGN_TOLERANCE:
             break
-    return aligned
+    reckoned = chain.dead_reckoned(variables.calibration)
+    last = nodes.searchsorted(np.arange(len(poses)), side="right") - 1
+    poses = compose(variables.poses[last], relative(reckoned[nodes[last]], reckoned))
+    return AlignedOdometry(poses, variables.calibration, nodes, graph, variables.layout)
 
 
 def all_detections(judged: JudgedLog) -> DetectionColumns:
@@ -214,7 +225,8 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
             revisit = None if found is None else revisit_of(found[0], so_far, found[1], newest)
         else:
             due = driven[newest] + closing.check_interval
-            revisit = return_to_beginning(seen, so_far, reckoned.covariances[newest], settings)
+            covariance = reckoned.covariances[reckoned.nodes.searchsorted(newest)]
+            revisit = return_to_beginning(seen, so_far, covariance, settings)
         if revisit is None:
             continue
         if not revisits:

@@ -1,4 +1,4 @@
-"""The least-squares problem of one or several logs, and its optimum by Levenberg-Marquardt in rounds."""
+"""The least-squares problem of one or several logs, and its optimum by Gauss-Newton in rounds."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from pathspace_graph.batch.association import (
     nearest_by,
 )
 from pathspace_graph.batch.simplification import reknot
-from pathspace_graph.errors import SettingsError, SingularSystemError
+from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
@@ -27,11 +27,10 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square, sensor_prior
-from pathspace_graph.graph.elimination import Damping, Elimination, fix_map, linear_graph, owners, solution
+from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners, solution
 from pathspace_graph.graph.rows import Revisit, Rows, at_values, by_widths, odometry_factor, revisit_rows
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
-    POINT,
     POSE,
     Layout,
     are_poses,
@@ -164,7 +163,9 @@ class BatchSystem:
                 groups += chain.rows(poses, calibration)
                 continue
             own = [chain.odometry_rows(poses, calibration), *chain.calibration_priors(calibration)]
-            groups += [in_drive(rows, d, part.start) for rows in own]
+            for rows in own:  # numbered as those of a drive alone
+                keys = rows.keys + np.where(are_poses(rows.keys), part.start, d)
+                groups.append(replace(rows, keys=keys, owner=rows.owner + owners(np.array(part.start))))
         for number in range(len(variables.sensor) // SENSOR_SIZE):  # each by its first drive
             prior = self.priors[sensors.index(number)].calibration
             groups.append(sensor_prior(of_sensor(variables.sensor, number), prior, number))
@@ -259,12 +260,6 @@ class BatchSystem:
         groups = [(label, rows) for label, one in weak.items() for rows in one.rows(state.variables)]
         return [replace(rows, owner=owners(rows.owner, label)) for label, rows in groups]
 
-    def track(self, state: State) -> CurveMap:
-        """The curves of a state with the detections of the problem."""
-        track = CurveMap(self.settings, state)
-        track.detections, track.stations, track.weak = self.detections, self.stations, self.weak
-        return track
-
     def linear_graph(self, at: Evaluation) -> gtsam.GaussianFactorGraph:
         """Linear graph of all rows; its solution is the change from the state."""
         return linear_graph(self.rows(at), at.state.variables)
@@ -272,15 +267,6 @@ class BatchSystem:
     def eliminated(self, at: Evaluation) -> Elimination:
         """Linear problem with its poses eliminated."""
         return Elimination(self.linear_graph(at), at.state.variables.layout)
-
-    def damping(self, state: State, weight: float) -> list[Rows]:
-        """Rows that damp the motion of control points relative to the poses beside them (1/m^2)."""
-        here, groups = state.variables, list[Rows]()
-        for label, one in self.weak.items():
-            root = np.tile(np.sqrt(weight) * np.eye(POINT), (len(one.keys), 1, 1))
-            rows = replace(one, whitener=root).places(here)
-            groups.append(replace(rows, residual=np.zeros(len(rows)), owner=owners(rows.owner, label)))
-        return groups
 
     def retract(self, state: State, step: Array) -> State:
         """Return the state after a step (n,) in relative coordinates.
@@ -305,12 +291,6 @@ class BatchSystem:
         keys = at.state.variables.keys
         graph = linear_graph(fix_map(self.rows(at)), at.state.variables)
         return solution(graph, Layout(keys[are_poses(keys)]))
-
-
-def in_drive(rows: Rows, number: int, first_cycle: int) -> Rows:
-    """Renumber rows of a drive alone, by its number and first cycle among several drives."""
-    keys = rows.keys + np.where(are_poses(rows.keys), first_cycle, number)
-    return replace(rows, keys=keys, owner=rows.owner + owners(np.array(first_cycle)))
 
 
 def seen_after_step(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
@@ -343,7 +323,8 @@ def nonlinear_graph(system: BatchSystem, at: Evaluation) -> gtsam.NonlinearFacto
     drives.
     """
     factors, graph = [*drive_factors(system, at)], gtsam.NonlinearFactorGraph()
-    track = system.track(at.state)
+    track = CurveMap(system.settings, at.state)
+    track.detections, track.stations, track.weak = system.detections, system.stations, system.weak
     for label in at.state.boundaries:
         factors += curve_factors(track, label)
     for factor in factors:
@@ -404,12 +385,12 @@ class Convergence:
     converged: bool
     reason: str
     rounds: int  # number of refreshes of foot points, gates and weights
-    steps: int  # Levenberg-Marquardt steps, including rejected ones
+    steps: int  # Gauss-Newton steps, including rejected lengths
     cost: float  # half the sum of squares with robust losses at the end
     gradient: float
     """Norm `sqrt(g' H^-1 g)` of the gradient g, with the information H of all variables: the length of the
-    last step in joint sigmas, or of the next one without convergence. A slow motion of the whole map counts
-    as much as the motion of one control point."""
+    last step in joint sigmas. A slow motion of the whole map counts as much as the motion of one control
+    point."""
 
 
 @dataclass(frozen=True)
@@ -433,33 +414,28 @@ class Stage:
 
 
 class Optimizer:
-    """Levenberg-Marquardt from a state to the minimum; `on_round` is called after each round."""
+    """Gauss-Newton from a state to the minimum; `on_round` is called after each round."""
 
     def __init__(
         self, system: BatchSystem, effort: Effort | None = None, on_round: Callable[[], None] | None = None
     ) -> None:
         self.system, self.settings = system, system.settings.batch
-        self.effort, self.damping, self._on_round = effort or Effort(), Damping(), on_round
+        self.effort, self._on_round = effort or Effort(), on_round
         self.steps = 0  # number of steps tried
         self._last_step: Array | None = None  # last step of the map and the calibration
 
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
-        """Find the optimum on curves with about one knot for each cone, which meet the cones."""
-        first, *others = self.schedule(state)
-        at, convergence = self.run(self.align_poses(state, first.gate), first)
-        for stage in others:
-            at, convergence = self.run(at.state, stage)
-        return at, convergence
+        """Find the optimum on curves with about one knot for each cone, which meet the cones.
 
-    def schedule(self, state: State) -> list[Stage]:
-        """Stages of the search; on closed curves, stations constrain the detections along them at the end."""
+        On closed curves, stations constrain the detections along them in the last stage.
+        """
         gate, rounds, rough = self.settings.gate, self.effort.rounds, self.effort.tolerance * ROUGH_TOLERANCE
         first_gate = gate if self.system.revisits else LOOSE_GATE
-        first = Stage(first_gate, self.effort.rough_rounds, rough, refit=True)
+        state = self.align_poses(state, first_gate)
+        at, _ = self.run(state, Stage(first_gate, self.effort.rough_rounds, rough, refit=True))
         curves = state.boundaries.values()
-        closed = bool(curves) and all(curve.periodic for curve in curves)
-        stations = self.system.settings.stations and closed
-        return [first, Stage(gate, rounds, self.effort.tolerance, refit=True, stations=stations)]
+        stations = self.system.settings.stations and bool(curves) and all(one.periodic for one in curves)
+        return self.run(at.state, Stage(gate, rounds, self.effort.tolerance, refit=True, stations=stations))
 
     def align_poses(self, state: State, gate: float) -> State:
         """Take one Gauss-Newton step of the poses alone, with fixed map and calibration."""
@@ -481,8 +457,8 @@ class Optimizer:
             state = reknot(state, system.detections, system.settings)
         locate_poses(state)
         system.begin(state, stage.stations)
-        self._last_step, searching, converged, done = None, True, False, 0
-        while not converged and done < rounds:
+        self._last_step, searching, converged, stuck, done = None, True, False, False, 0
+        while not (converged or stuck) and done < rounds:
             done, gate = done + 1, max(gate, self.settings.gate)
             strict = gate <= self.settings.gate
             if searching:
@@ -492,65 +468,43 @@ class Optimizer:
                 at = system.evaluate(state, hold=True)
                 settled = changed <= CHANGED_SHARE * len(system.detections) or done > rounds // 2
                 searching = not (strict and settled)
-            at, decrease = self._step(at, tolerance)
-            state = at.state
+            at, decrease = self._step(at)
+            stuck, state = not searching and at.state is state, at.state
             if self._on_round is not None:
                 self._on_round()
             converged = not searching and decrease <= tolerance
             gate *= GATE_FACTOR
-        reason = "nothing changes any more" if converged else "no round left"
-        if not converged:
-            rows, variables = system.rows(at), at.state.variables
-            undamped = solution(linear_graph(rows, variables), variables.layout)
-            decrease = predicted_decrease(rows, variables.layout, undamped)
+        reason = "no part of the last step decreases the cost" if stuck else "no round left"
+        reason = "nothing changes any more" if converged else reason
         norm = float(np.sqrt(2.0 * max(decrease, 0.0)))
         return at, Convergence(converged, reason, done, self.steps, at.cost, norm)
 
-    def _keep_foot_points(self, at: Evaluation) -> None:
-        """Let later evaluations refine the foot points from their present places."""
-        self.system.detections.refine(at.across.rows, at.u)
+    def _step(self, at: Evaluation) -> tuple[Evaluation, float]:
+        """Take a Gauss-Newton step, halved until the cost does not grow; return the decrease it predicts.
 
-    def _step(self, at: Evaluation, tolerance: float) -> tuple[Evaluation, float]:
-        """Take the least damped step that decreases the cost; without one, the problem does not change.
-
-        Return the problem and the predicted decrease. A step within the tolerance is not tried again.
+        The problem stays as it is if no part of the step decreases the cost. On a long road, a whole step
+        turns the map by more than its linearization holds for.
         """
-        self._keep_foot_points(at)
-        rows = self.system.rows(at)
-        decrease = np.inf
-        while not self.damping.exhausted:
+        system, state, layout, cost = self.system, at.state, at.state.variables.layout, at.cost
+        system.detections.refine(at.across.rows, at.u)  # later evaluations refine these foot points
+        rows = system.rows(at)
+        step = solution(linear_graph(rows, state.variables), layout)
+        decrease, before, self._last_step = predicted_decrease(rows, layout, step), self._last_step, None
+        for share in 0.5 ** np.arange(8):
             self.steps += 1
-            trial, decrease = self._trial(at, rows)
-            if trial is not None:
-                self.damping.lower()
-                self._keep_foot_points(trial)
-                return trial, decrease
-            if decrease <= tolerance:
-                return at, decrease
-            self.damping.grow()
-        self.damping.reset()
-        return at, decrease
-
-    def _trial(self, at: Evaluation, rows: Sequence[Rows]) -> tuple[Evaluation | None, float]:
-        """Return the problem after a damped step, None if the cost has grown, and the predicted decrease."""
-        state, system, layout = at.state, self.system, at.state.variables.layout
-        damped = [*rows, *system.damping(state, self.damping.weight)]
-        try:
-            step = solution(linear_graph(damped, state.variables), layout)
-        except SingularSystemError:
-            return None, np.inf
-        decrease = np.inf
-        if self.damping.is_light:  # a strongly damped step is short without convergence
-            decrease = predicted_decrease(rows, layout, step)
-        trial = system.evaluate(system.retract(state, step))
-        if trial.cost > at.cost:
-            return None, decrease
-        before, self._last_step = self._last_step, step[: layout.size - state.poses.size]
-        factor = 1.0 if before is None else extrapolation_factor(self._last_step, before)
-        if factor == 1.0:
-            return trial, decrease
-        other = system.evaluate(system.retract(state, factor * step))
-        return min(trial, other, key=lambda evaluation: evaluation.cost), decrease
+            trial = system.evaluate(system.retract(state, share * step))
+            if trial.cost <= cost:
+                break
+        else:
+            return at, decrease
+        if share == 1.0:
+            self._last_step = step[: layout.size - state.poses.size]
+            factor = 1.0 if before is None else extrapolation_factor(self._last_step, before)
+            if factor != 1.0:
+                other = system.evaluate(system.retract(state, factor * step))
+                trial = min(trial, other, key=lambda evaluation: evaluation.cost)
+        system.detections.refine(trial.across.rows, trial.u)
+        return trial, decrease
 
 
 def extrapolation_factor(step: Array, before: Array) -> float:

@@ -211,29 +211,3 @@ def _eliminated(
     for conditional in reversed(factors_of(graph_of(tree))):  # a tree gives its root first
         net.push_back(cast("gtsam.GaussianConditional", conditional))
     return net, remaining
-
-
-class Damping:
-    """Levenberg-Marquardt's weight: divided by 10 after an accepted step, times 5 after a rejected one."""
-
-    def __init__(self, first: float = 1e-2, least: float = 1e-6, most: float = 1e6) -> None:
-        self._first, self._least, self._most = first, least, most
-        self.weight = first
-
-    @property
-    def exhausted(self) -> bool:
-        return self.weight > self._most
-
-    @property
-    def is_light(self) -> bool:
-        """Whether no more than in a first step."""
-        return self.weight <= self._first
-
-    def lower(self) -> None:
-        self.weight = max(0.1 * self.weight, self._least)
-
-    def grow(self) -> None:
-        self.weight *= 5.0
-
-    def reset(self) -> None:
-        self.weight = self._first

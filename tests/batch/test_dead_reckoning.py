@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.start import aligned_odometry, start_odometry
@@ -77,8 +78,27 @@ def test_a_vehicle_that_rests_far_from_its_start_is_not_taken_for_free() -> None
     np.testing.assert_allclose(aligned.covariances[-1, 2, 2], 1e-10 + (sigmas[:, 2] ** 2).sum(), rtol=1e-4)
 
 
-def test_what_is_aligned_is_a_minimum_of_odometry_and_revisits() -> None:
+def test_poses_every_few_metres_are_aligned_as_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Within centimetres, and about as certain, from a tenth of the variables."""
+    _, chain = drifting()
+    few = aligned_odometry(chain, revisits())
+    monkeypatch.setattr("pathspace_graph.batch.start.NODE_STEP", 1e-6)
+    every = aligned_odometry(chain, revisits())
+    assert len(few.nodes) < 0.2 * len(every.nodes) == 0.2 * len(chain)
+    off = few.poses - every.poses
+    assert np.hypot(*off[:, :2].T).max() < 0.05
+    assert np.abs(off[:, 2]).max() < 0.005
+    np.testing.assert_allclose(few.calibration, every.calibration, rtol=1e-3, atol=1e-6)
+    sigmas = (
+        np.sqrt(np.diagonal(one, axis1=1, axis2=2)) for one in (few.covariances, every.covariances[few.nodes])
+    )
+    np.testing.assert_allclose(*sigmas, rtol=1e-3)
+
+
+def test_what_is_aligned_is_a_minimum_of_odometry_and_revisits(monkeypatch: pytest.MonkeyPatch) -> None:
     """The gradient by every pose is that of the odometry alone where a pose has no revisit."""
+    monkeypatch.setattr("pathspace_graph.batch.start.NODE_STEP", 1e-6)
+    monkeypatch.setattr("pathspace_graph.batch.start.ALIGN_TOLERANCE", 0.1)
     _, chain = drifting()
     again = revisits()
     aligned = aligned_odometry(chain, again)

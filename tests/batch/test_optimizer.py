@@ -1,4 +1,4 @@
-"""The batch's optimizer: its schedule of gates, its end, its damping, and the steps that it lengthens."""
+"""The batch's optimizer: its schedule of gates, its end, and the steps that it shortens or lengthens."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pathspace_graph.batch.system import (
     LOOSE_GATE,
     TOLERANCE_DECREASE,
     BatchSystem,
+    Convergence,
     Evaluation,
     Optimizer,
     Stage,
     extrapolation_factor,
     predicted_decrease,
 )
-from pathspace_graph.factors.se2 import to_vehicle
-from pathspace_graph.graph.elimination import Damping, solution
+from pathspace_graph.graph.elimination import solution
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -41,9 +41,17 @@ def noisy() -> tuple[BatchSystem, State]:
     return drawn(exact, np.random.default_rng(3))[0], truth
 
 
-def test_the_schedule_of_open_curves_has_no_stations_and_ends_with_the_tight_gate() -> None:
+def test_open_curves_have_no_stations_and_end_with_the_tight_gate(monkeypatch: pytest.MonkeyPatch) -> None:
     system, state = noisy()
-    first, last = Optimizer(system).schedule(state)
+    stages, run = list[Stage](), Optimizer.run
+
+    def noted(optimizer: Optimizer, state: State, stage: Stage) -> tuple[Evaluation, Convergence]:
+        stages.append(stage)
+        return run(optimizer, state, stage)
+
+    monkeypatch.setattr(Optimizer, "run", noted)
+    Optimizer(system).find(state)
+    first, last = stages
     assert (first.gate, first.refit, last.gate, last.refit) == (LOOSE_GATE, True, BATCH.gate, True)
     assert first.tolerance > last.tolerance
     assert not (first.stations or last.stations)
@@ -145,25 +153,28 @@ def test_the_cost_never_grows_in_a_step() -> None:
     assert (np.diff(costs) < 1e-3).all()
 
 
-def test_a_damping_that_is_too_large_leaves_the_map_beside_its_poses() -> None:
-    """The poses are free, as they aren't damped, and the map goes with them."""
+def test_a_step_that_is_too_long_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three times the step to the minimum makes the cost larger, half of that makes it smaller."""
+    monkeypatch.setattr("pathspace_graph.batch.system.solution", lambda *problem: 3.0 * solution(*problem))
     system, state = noisy()
-    optimizer = Optimizer(system)
-    optimizer.damping = Damping(first=1e9, least=1e9, most=1e13)
-    at, _ = optimizer.run(state, Stage(BATCH.gate, 1))
-    assert np.abs(at.state.poses - state.poses).max() > 1e-3
-    for label, weak in system.weak.items():
-        seen = to_vehicle(state.control_points(label), state.poses[weak.cycle])
-        after = to_vehicle(at.state.control_points(label), at.state.poses[weak.cycle])
-        np.testing.assert_allclose(after, seen, atol=1e-6)
+    variables = state.variables
+    off = np.random.default_rng(4).normal(0.0, 1e-3, len(variables.values))
+    optimizer, state = Optimizer(system), system.retract(state, off)
+    at, convergence = optimizer.run(state, Stage(BATCH.gate, 1))
+    assert convergence.steps == 2
+    assert at.cost < system.evaluate(state).cost
 
 
-def test_where_no_damping_is_allowed_nothing_moves() -> None:
+def test_it_ends_where_no_part_of_a_step_decreases_the_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Backwards, the cost grows: nothing moves, and no round repeats what has failed."""
+    monkeypatch.setattr("pathspace_graph.batch.system.solution", lambda *problem: -solution(*problem))
+    monkeypatch.setattr("pathspace_graph.batch.system.predicted_decrease", lambda *problem: 1.0)
     system, state = noisy()
-    refused = Optimizer(system)
-    refused.damping = Damping(first=1.0, most=0.1)
-    at, _ = refused.run(state, Stage(BATCH.gate, 1))
+    at, convergence = Optimizer(system).run(state, Stage(BATCH.gate, 40))
     np.testing.assert_array_equal(at.state.variables.values, state.variables.values)
+    assert not convergence.converged
+    assert convergence.reason == "no part of the last step decreases the cost"
+    assert convergence.rounds < 5
 
 
 def test_the_poses_alone_are_aligned_beside_the_map() -> None:

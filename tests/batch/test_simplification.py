@@ -89,7 +89,7 @@ def test_the_new_control_points_are_linear_in_the_old_ones() -> None:
     bump = np.zeros_like(state.map_points)
     bump[:, 1] = np.sin(state.map_points[:, 0] / 8.0)
     moved = (change @ bump.ravel()).reshape(-1, 2)[:, 1]
-    np.testing.assert_allclose(moved, np.sin(few.map_points[:, 0] / 8.0), atol=0.15)
+    np.testing.assert_allclose(moved, np.sin(few.map_points[:, 0] / 8.0), atol=0.2)
 
 
 def test_scatter_grows_from_seen_to_unseen() -> None:
