@@ -59,7 +59,7 @@ def test_a_window_of_all_cycles_has_the_optimum_of_the_batch() -> None:
     mapper, system, at = both()
     optimizer, smoother = Optimizer(system), mapper.road.smoother.copy()
     for damped in [True] * 5 + [False] * 20:
-        at = optimizer._step(system.evaluate(at.state, hold=True), 0.0)[0]
+        at = optimizer._step(system.evaluate(at.state, hold=True))[0]
         smoother.step(mapper.settings.sigma_step if damped else None)
     assert np.abs(at.state.poses - both()[2].state.poses).max() > 0.05  # where both began
     np.testing.assert_allclose(smoother.variables.poses, at.state.poses, atol=1e-5)
