@@ -29,8 +29,11 @@ def rotation(theta: float) -> Array:
 
 def rotations(theta: Array) -> Array:
     """Rotation matrices R(theta) (m, 2, 2) of angles (m,)."""
-    c, s = np.cos(theta), np.sin(theta)
-    return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+    turn = np.empty((len(theta), 2, 2))
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(theta)
+    turn[:, 1, 0] = np.sin(theta)
+    turn[:, 0, 1] = -turn[:, 1, 0]
+    return turn
 
 
 def rotated(covariances: Array, theta: Array) -> Array:
