@@ -67,8 +67,7 @@ def twist_noise(odometry: Odometry) -> tuple[Array, float] | None:
 # --- sightings of cones ----------------------------------------------------------------------------------
 
 FOLLOW_RANGE: Final = 30.0  # largest range of a tracked cone (m): few cones beyond are seen from near later
-GATE_LEAST: Final = 0.4  # distance within which a sighting is of a cone (m)
-GATE_MOST: Final = 3.0  # largest such distance (m); a narrow gate would cut off the noise
+GATE_MOST: Final = 3.0  # largest distance of a sighting of a cone (m); a narrow gate would cut off the noise
 FIRST_ALONG: Final = RayNoise(np.array([0.1, 0.04]))  # initial noise along the ray
 FIRST_ACROSS: Final = RayNoise(np.array([0.05, 0.016]))  # and across it
 
@@ -116,7 +115,7 @@ class Sightings:
         covariances = rays.covariances(self.point, inflated=False)
         assert covariances is not None
         points = to_map(noise.corrected(self.point, self.twist), self.pose)
-        cones = Tracks(GATE_LEAST, most=GATE_MOST / GATE_LEAST, sigmas=3.5)
+        cones = Tracks(0.4, most=GATE_MOST / 0.4, sigmas=3.5)
         return replace(self, cone=cones.add(points, rotated(covariances, self.pose[:, 2]), self.cone, self.t))
 
 
@@ -127,9 +126,7 @@ PRIOR: Final = np.array([0.1, 0.1, 0.3, 0.3, 0.5, 0.02, 0.02])
 (1/m) and bias of the yaw rate (rad/s). Without the bend, yaw, lateral offset and scale would absorb it."""
 OF_BEND: Final = SENSOR_SIZE  # index of the bend among the constants
 PASSES: Final = 4  # passes over the cycles, each of which tracks the cones again
-ROUNDS_FIRST: Final = 5  # alternations of errors, noise and weights in a pass
-ROUNDS_AGAIN: Final = 3  # alternations in a pass that starts from measured noise, nearly converged
-CLUSTER_TIME: Final = 3.0  # time (s) over which errors of the odometry are correlated
+ROUNDS: Final = (5, 3)  # alternations in a pass, and in one that starts from measured noise
 NOISE_HUBER: Final = 2.0  # threshold of Huber's loss (sigmas)
 MIN_ROWS: Final = 60  # least number of sightings with a reference from which noise is estimated
 NEAR_SHARE: Final = 0.6  # references of a sighting: sightings of its cone within this share of its range
@@ -154,17 +151,17 @@ def derivatives_by_constants(table: Sightings, first: IntArray, seen: Array) -> 
 
 def runs(groups: IntArray) -> tuple[IntArray, IntArray]:
     """Return the first row (c,) and the size (c,) of each group; equal groups (n,) are adjacent."""
-    begins = np.flatnonzero(np.diff(groups, prepend=-1))
+    begins = np.flatnonzero(np.diff(groups, prepend=groups[:1] - 1))
     return begins, np.diff(np.append(begins, len(groups)))
 
 
 def clustered(middle: Array, scores: Array, covariance: Array) -> Array:
     """Return the cluster-robust covariance `P (sum g g') P` (7, 7) of the constants (White's estimator).
 
-    g sums the scores (c, 7) of the cones seen in a stretch of `CLUSTER_TIME` seconds, by the mean stamp
-    `middle` (c,) of each cone, in s. So it includes the errors of the odometry.
+    g sums the scores (c, 7) of the cones seen in a stretch of 3 seconds, by the mean stamp `middle` (c,) of
+    each cone, in s. So it includes the errors of the odometry, which are correlated over such a time.
     """
-    _, stretch = np.unique(np.floor(middle / CLUSTER_TIME), return_inverse=True)
+    _, stretch = np.unique(np.floor(middle / 3.0), return_inverse=True)
     count = int(stretch.max()) + 1
     summed = np.zeros((count, scores.shape[1]))
     np.add.at(summed, stretch, scores)
@@ -288,7 +285,7 @@ def measured_by_cones(cycles: Sequence[SeenCycle], found: MeasuredNoise) -> Iter
         points, ranges = to_map(table.point, table.pose), np.hypot(*table.point.T)
         columns = derivatives_by_constants(table, first, table.point)
         noise, weights = (found.along or FIRST_ALONG, found.across or FIRST_ACROSS), np.ones(len(ranges))
-        for _ in range(ROUNDS_AGAIN if found.along else ROUNDS_FIRST):
+        for _ in range(ROUNDS[found.along is not None]):
             yield None
             # Find the constants b by least squares on the linear model `p + A b` of the sightings. The
             # cones' positions, weighted means of it, are eliminated.

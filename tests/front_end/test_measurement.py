@@ -25,8 +25,7 @@ from pathspace_graph.front_end.measurement import (
     OF_BEND,
     PASSES,
     PRIOR,
-    ROUNDS_AGAIN,
-    ROUNDS_FIRST,
+    ROUNDS,
     SeenCycle,
     Sightings,
     dead_reckoned,
@@ -414,5 +413,5 @@ def test_a_measurement_has_short_steps_and_few_of_them_where_it_is_small(seconds
     assert steps is not None
     *before, last = steps
     assert before == [None] * len(before) and last is not None and last.along is not None
-    rounds, is_small = ROUNDS_FIRST + (PASSES - 1) * ROUNDS_AGAIN, seconds == 8.0
+    rounds, is_small = ROUNDS[0] + (PASSES - 1) * ROUNDS[1], seconds == 8.0
     assert len(before) + 1 == (PASSES + rounds if is_small else 2 * (PASSES + rounds) + 1)
