@@ -104,6 +104,7 @@ def measured_by_lines(cycles: Sequence[SeenCycle], found: MeasuredNoise) -> Iter
     those of the directions along and across the ray in the normal, squared.
     """
     table, walk = Sightings.of(cycles), found.odometry * np.sqrt(found.interval)
+    yield None
     least = MIN_SPEED_SHARE * np.median([np.hypot(*one.twist[:2]) for one in cycles])
     moving = np.flatnonzero(np.hypot(*table.twist[:, :2].T) > least)
     seen = table.where(moving[:: max(-(-len(moving) // 4000), 1)])
@@ -146,6 +147,7 @@ def measured_by_lines(cycles: Sequence[SeenCycle], found: MeasuredNoise) -> Iter
             q = np.repeat(shape @ np.append(errors, 1.0), counts, axis=0)
             slopes = q[:, 1] + 2.0 * q[:, 2] * s
             weights = huber_weights(off / np.sqrt(variance), NOISE_HUBER) ** 2
+        yield None
         leverage = weight * np.einsum("nk,nkl,nl->n", basis, np.repeat(inverse, counts, axis=0), basis)
         slow, room = (shares * drift).sum(axis=0), np.maximum(1.0 - leverage, 0.1)
         square = np.minimum(off**2 / (room * variance), 9.0) - slow / variance  # outliers hardly count here

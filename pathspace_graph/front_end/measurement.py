@@ -44,23 +44,23 @@ def without_repeats(parts: Sequence[Odometry]) -> Odometry:
     return Odometry(t[new][-MOST_TWISTS:], twists[new][-MOST_TWISTS:])
 
 
-def twist_noise(odometry: Odometry) -> tuple[Array, float] | None:
+def twist_noise(*parts: Odometry) -> tuple[Array, float] | None:
     """Return the noise (k, 3) of a twist by differences of second to fourth order, and their interval (s).
 
     The noise by order k is the scaled median absolute difference over `sqrt(binomial(2 k, k))`. The least is
     the white noise; it is not white if orders disagree. None for too few twists.
     """
-    odometry = without_repeats([odometry])
-    twists, orders = odometry.twist, list[Array]()
-    if len(twists) < MIN_TWISTS:
+    odometry = without_repeats(parts)
+    twists, orders = odometry.twist.T, list[Array]()
+    if len(odometry.t) < MIN_TWISTS:
         return None
-    speeds = np.hypot(twists[:, 0], twists[:, 1])
-    drives = speeds > MIN_SPEED_SHARE * np.median(speeds)
-    for k in (2, 3, 4):
-        inside = np.lib.stride_tricks.sliding_window_view(drives, k + 1).all(axis=1)
-        if inside.sum() >= MIN_TWISTS // 2:
-            differences = np.abs(np.diff(twists, k, axis=0)[inside])
-            orders.append(MAD * np.median(differences, axis=0) / np.sqrt(comb(2 * k, k)))
+    speeds = np.hypot(twists[0], twists[1])
+    inside = drives = speeds > MIN_SPEED_SHARE * np.median(speeds)
+    for k in (1, 2, 3, 4):
+        inside, twists = inside[:-1] & drives[k:], np.diff(twists)
+        if k > 1 and inside.sum() >= MIN_TWISTS // 2:
+            differences = np.abs(twists[:, inside])
+            orders.append(MAD * np.median(differences, axis=1) / np.sqrt(comb(2 * k, k)))
     return (np.array(orders), float(np.median(np.diff(odometry.t)))) if orders else None
 
 

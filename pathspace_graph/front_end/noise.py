@@ -99,8 +99,7 @@ class NoiseLearner(Copyable):
                 return True
         elif self._driven >= self._due:
             self._due = AGAIN * self._driven
-            twists = without_repeats(self._twists)
-            self._steps = begun(self._cycles, twists, self.measured, of_lines=self._of_lines)
+            self._steps = begun(self._cycles, self._twists, self.measured, of_lines=self._of_lines)
         return False
 
     def for_check(self, detections: Detections, twist: Array) -> Detections:
@@ -226,10 +225,10 @@ def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
 
 
 def begun(
-    cycles: Sequence[SeenCycle], odometry: Odometry, known: MeasuredNoise | None, *, of_lines: bool
+    cycles: Sequence[SeenCycle], twists: Sequence[Odometry], known: MeasuredNoise | None, *, of_lines: bool
 ) -> Iterator[MeasuredNoise | None] | None:
     """Start a measurement on cones or on lines; None without a cycle, or without noise of the odometry."""
-    of_twists = twist_noise(odometry)
+    of_twists = twist_noise(*twists)
     if of_twists is None or len(cycles) == 0:
         return None
     sigma, interval = of_twists[0].min(axis=0), of_twists[1]
@@ -242,5 +241,5 @@ def measure_noise(
     cycles: Sequence[SeenCycle], odometry: Odometry, *, of_lines: bool = False
 ) -> MeasuredNoise | None:
     """Measure the noise of cones or of lines; None if not even the odometry's noise can be estimated."""
-    steps = begun(cycles, odometry, None, of_lines=of_lines)
+    steps = begun(cycles, [odometry], None, of_lines=of_lines)
     return None if steps is None else next(found for found in steps if found is not None)

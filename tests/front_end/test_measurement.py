@@ -56,7 +56,7 @@ WHITE = np.array([0.06, 0.03, 0.004])
 def white(t: Array, twists: Array) -> tuple[Array, float] | None:
     """White noise and interval of twists that come some for each cycle."""
     parts = [Odometry(t[begin : begin + 7], twists[begin : begin + 7]) for begin in range(0, len(t), 7)]
-    found = twist_noise(without_repeats(parts))
+    found = twist_noise(*parts)
     return None if found is None else (found[0].min(axis=0), found[1])
 
 
@@ -409,7 +409,7 @@ def test_a_measurement_has_short_steps_and_few_of_them_where_it_is_small(seconds
     """The first one has a step for each round; of more sightings, constants and noise are two."""
     cycles, odometry = CAMERAS["white"].drive(0)
     cycles = [cycle for cycle in cycles if cycle.detections.t <= seconds]
-    steps = begun(cycles, odometry, None, of_lines=False)
+    steps = begun(cycles, [odometry], None, of_lines=False)
     assert steps is not None
     *before, last = steps
     assert before == [None] * len(before) and last is not None and last.along is not None
