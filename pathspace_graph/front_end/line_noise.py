@@ -104,20 +104,17 @@ def measured_by_lines(cycles: Sequence[SeenCycle], found: MeasuredNoise) -> Iter
     those of the directions along and across the ray in the normal, squared.
     """
     table, walk = Sightings.of(cycles), found.odometry * np.sqrt(found.interval)
-    yield None
     least = MIN_SPEED_SHARE * np.median([np.hypot(*one.twist[:2]) for one in cycles])
     moving = np.flatnonzero(np.hypot(*table.twist[:, :2].T) > least)
     seen = table.where(moving[:: max(-(-len(moving) // 4000), 1)])
     noise, again = (found.along or FIRST_ALONG, found.across or FIRST_ACROSS), found.along is not None
     errors = np.array([*found.sensor, found.range_bend, 0.0]) if again else np.zeros(len(PRIOR))
-    # with three iterations in each, the constants are within 0.2 of their sigmas of those after 25 rounds
-    for _ in range(2 if again else 5):
+    for _ in range(3 if again else 8):  # nearly converged, or not
         yield None
         table, begins, counts = in_cells(seen, errors)
         if len(table.t) < MIN_ROWS:
             yield found
             return
-        yield None
         columns = derivatives_by_constants(table, np.repeat(begins, counts), table.point)
         points = to_map(table.point, table.pose) + np.tensordot(columns, errors, 1)
         axes, ranges = map_rays(table), np.hypot(*table.point.T)
@@ -128,8 +125,7 @@ def measured_by_lines(cycles: Sequence[SeenCycle], found: MeasuredNoise) -> Iter
         tangents, s, y = _frames(points, 1.0 / variances.sum(axis=0), begins, counts)
         basis, start = np.stack([np.ones(len(s)), s, s**2], axis=1), errors
         slopes, weights = np.zeros(len(s)), np.ones(len(s))
-        for _ in range(3):  # with the slopes and weights of the step before
-            yield None
+        for _ in range(4):  # with the slopes and weights of the iteration before
             normals = left_of(tangents) - slopes[:, None] * tangents
             shares = on_axes(normals, axes) ** 2
             variance = (shares * variances).sum(axis=0)
@@ -147,7 +143,6 @@ def measured_by_lines(cycles: Sequence[SeenCycle], found: MeasuredNoise) -> Iter
             q = np.repeat(shape @ np.append(errors, 1.0), counts, axis=0)
             slopes = q[:, 1] + 2.0 * q[:, 2] * s
             weights = huber_weights(off / np.sqrt(variance), NOISE_HUBER) ** 2
-        yield None
         leverage = weight * np.einsum("nk,nkl,nl->n", basis, np.repeat(inverse, counts, axis=0), basis)
         slow, room = (shares * drift).sum(axis=0), np.maximum(1.0 - leverage, 0.1)
         square = np.minimum(off**2 / (room * variance), 9.0) - slow / variance  # outliers hardly count here
