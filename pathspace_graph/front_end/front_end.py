@@ -19,7 +19,7 @@ from pathspace_graph.settings.mapper import MapperSettings
 
 from .gate import Admitted, Gate
 from .log_odometry import LogOdometry, chained
-from .measurement import SeenCycle, dead_reckoned
+from .measurement import SeenCycle, dead_reckoned, runs
 from .motion import MATCHING, MotionCheck
 from .noise import NoiseLearner, measure_noise
 from .sides import SideJudge
@@ -33,7 +33,6 @@ COLOURLESS: Final = {  # notices of the cycle in which most colours become unkno
     True: "most detections have no colour: the driven path determines their sides",
     False: "most detections have a colour again",
 }
-NEAREST: Final = 2  # number of nearest cones that must be orange in a lane of orange cones
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +74,10 @@ class FrontEnd(Copyable):
         checked = noise.for_check(cones, odometry.twist[-1] if len(odometry.t) else np.zeros(3))
         motion = check.update(odometry, checked, may_contradict=noise.is_settled)
         swapped, colourless = sides.swapped, sides.colourless
-        labels = sides.update(check.pose, motion.twists, checked, in_lane=in_lane).labels
+        labels = sides.update(check.pose, motion.twists, checked, in_lane=in_lane)
         notices = [SWAPPED[sides.swapped]] if sides.swapped != swapped else []
         notices += [COLOURLESS[sides.colourless]] if sides.colourless != colourless else []
-        cones = replace(cones, labels=labels)
+        cones = Detections(cones.t, cones.points_vehicle, cones.covariances, labels)
         for_map, orange_for_map = noise.for_map(cones), noise.for_map(orange)
         settings, calibration = self._settings, self._settings.calibration
         # measured noise includes measured errors of the sensor, and `calibrated` checks its prior with them
@@ -137,12 +136,13 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
 def split_detections(detections: Detections, settings: MapperSettings) -> tuple[Detections, Detections, bool]:
     """Split detections into those of boundaries, points of lines merged, and orange cones.
 
-    The third value is whether the nearest cones are orange: the vehicle drives to the track, or is at a gate.
+    The third value is whether the two nearest cones are orange: the vehicle drives to the track, or is at a
+    gate.
     """
     of_orange = is_orange(detections)
     cones, in_lane = detections.where(~of_orange), False
-    if of_orange.sum() >= NEAREST:
-        nearest = np.argsort(np.hypot(*detections.points_vehicle.T), kind="stable")[:NEAREST]
+    if np.count_nonzero(of_orange) >= 2:
+        nearest = np.argsort(np.hypot(*detections.points_vehicle.T), kind="stable")[:2]
         in_lane = bool(of_orange[nearest].all())
     return merged(cones) if settings.of_lines else cones, detections.where(of_orange), in_lane
 
@@ -157,12 +157,12 @@ def merged(line: Detections) -> Detections:
     column, row = np.floor(line.points_vehicle.T / np.ldexp(1.0, doublings)).astype(np.intp)
     # one number for label and cell, as no sensor sees 2^20 cells in a row; unique rows take six times as long
     keys = (((line.labels << 6) + doublings << 20) + column << 20) + row
-    _, first, cell, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
-    columns = [*line.points_vehicle.T, *line.covariances.reshape(-1, 4).T]
-    sums = np.column_stack([np.bincount(cell, values, len(counts)) for values in columns])
-    means = sums / counts[:, None]
+    order = np.argsort(keys, kind="stable")
+    begins, counts = runs(keys[order])
+    columns = np.column_stack([line.points_vehicle, line.covariances.reshape(-1, 4)])
+    means = np.add.reduceat(columns[order], begins) / counts[:, None]
     covariances = means[:, 2:].reshape(-1, 2, 2) / counts[:, None, None]
-    return Detections(line.t, means[:, :2], covariances, line.labels[first])
+    return Detections(line.t, means[:, :2], covariances, line.labels[order[begins]])
 
 
 def is_orange(detections: Detections) -> BoolArray:
@@ -182,7 +182,7 @@ def seen_cycles(log: Log, settings: MapperSettings | None = None) -> list[SeenCy
     poses = dead_reckoned(log.odometry, np.array([cycle.t for cycle in log.cycles]))
     for pose, (odometry, detections) in zip(poses, split_odometry(log), strict=True):
         cones, _, in_lane = split_detections(detections, settings)
-        labelled = sides.update(pose, odometry.twist, cones, in_lane=in_lane)
+        labelled = replace(cones, labels=sides.update(pose, odometry.twist, cones, in_lane=in_lane))
         twist = odometry.twist[-1] if len(odometry.t) else np.zeros(3)
         cycles.append(SeenCycle(labelled, pose, twist))
     return cycles

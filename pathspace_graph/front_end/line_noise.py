@@ -5,17 +5,16 @@ they were seen from. What is left across the parabola shows the constant errors 
 where the ray meets the line steeply, across the ray where it runs beside the line.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import scipy  # which imports its modules when they are used
 
-from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, IntArray
-from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, huber_weights, ray_axes
-from pathspace_graph.factors.se2 import left_of, rotations, to_map
+from pathspace_graph.factors.noise import MeasuredNoise, RayNoise, huber_weights
+from pathspace_graph.factors.se2 import left_of, to_map
 from pathspace_graph.mapping.tracks import RECKONED
 
 from .measurement import (
@@ -33,8 +32,12 @@ from .measurement import (
     Sightings,
     clustered,
     derivatives_by_constants,
+    frequency,
     line_through,
+    map_rays,
+    on_axes,
     runs,
+    sigmas_by_range,
     with_detections,
 )
 
@@ -49,14 +52,11 @@ def in_cells(table: Sightings, errors: Array) -> tuple[Sightings, IntArray, IntA
     Constant errors (7,) are undone. A cell that is seen again later is another one.
     """
     at = np.arange(len(table.t), dtype=np.intp)
-    cell = np.floor(
-        (to_map(table.point, table.pose) + derivatives_by_constants(table, at, table.point) @ errors) / CELL
-    )
-    cell = np.column_stack([cell, table.cone])
-    order = np.lexsort((table.t, *cell.T))
-    cell, t = cell[order], table.t[order]
-    new = np.diff(t, prepend=-np.inf) > RECKONED
-    new |= (np.diff(cell, axis=0, prepend=np.nan) != 0.0).any(axis=1)
+    shift = np.tensordot(derivatives_by_constants(table, at, table.point), errors, 1)
+    x, y = np.floor((to_map(table.point, table.pose) + shift) / CELL).astype(np.intp).T
+    cell = ((table.cone << 20) + y << 20) + x  # one number, as no drive is 2^19 cells long
+    order, new = np.argsort(cell, kind="stable"), np.ones(len(cell), bool)  # in order of time in each cell
+    new[1:] = (np.diff(cell[order]) != 0) | (np.diff(table.t[order]) > RECKONED)
     number = np.cumsum(new) - 1
     ranges = np.hypot(*table.point[order].T)
     begins, counts = runs(number)
@@ -64,64 +64,6 @@ def in_cells(table: Sightings, errors: Array) -> tuple[Sightings, IntArray, IntA
     chosen = ((counts >= 8) & (nearest < NEAR_SHARE * farthest))[number]
     table = replace(table.where(order[chosen]), cone=number[chosen])
     return table, *runs(table.cone)
-
-
-def fit(
-    table: Sightings, errors: Array, noise: Rays, walk: Array
-) -> tuple[Sightings, IntArray, Array, Array, Rays] | None:
-    """Fit parabolas and constants by least squares, and the noise that is left across the parabolas.
-
-    The odometry walks (3,) by m, m and rad in the root of a second. Returned are the points in cells, the
-    number (c,) in each cell, the constants (7,) of `measurement:PRIOR`, their standard deviations, and the
-    noise along and across the ray by range; None if too few points determine them. The square of what is left
-    has the expectation `(1 - leverage) sum_k share_k (a_k^2 + b_k^2 r^2)`, which is linear in the squares of
-    the noise: the shares are those of the directions along and across the ray in the normal, squared.
-    """
-    table, begins, counts = in_cells(table, errors)
-    if len(table.t) < MIN_ROWS:
-        return None
-    columns = derivatives_by_constants(table, np.repeat(begins, counts), table.point)
-    points, ranges = to_map(table.point, table.pose) + columns @ errors, np.hypot(*table.point.T)
-    axes = np.einsum("nij,nkj->kni", rotations(table.pose[:, 2]), ray_axes(table.point))
-    lag = np.abs(table.t - np.repeat(np.add.reduceat(table.t, begins) / counts, counts))
-    drift = lag * np.array([np.full(len(ranges), walk[0] ** 2), walk[1] ** 2 + (walk[2] * ranges) ** 2])
-    variances = np.array([one.sigmas(ranges) ** 2 for one in noise]) + drift
-    tangents, s, y = _frames(points, 1.0 / variances.sum(axis=0), begins, counts)
-    basis = np.stack([np.ones(len(s)), s, s**2], axis=1)
-    slopes, weights, cell = np.zeros(len(s)), np.ones(len(s)), np.repeat(np.arange(len(counts)), counts)
-    for _ in range(4):  # with the slopes and weights of the step before
-        normals = left_of(tangents) - slopes[:, None] * tangents
-        shares = np.array([(normals * axis).sum(axis=1) ** 2 for axis in axes])
-        variance = (shares * variances).sum(axis=0)
-        weight = weights / variance
-        rows = np.einsum("ni,nij->nj", normals, columns)
-        rows = np.column_stack([rows, y - rows @ errors])
-        weighted = basis * weight[:, None]
-        normal = np.add.reduceat(weighted[:, :, None] * basis[:, None], begins) + np.diag(SHAPE)
-        inverse = np.linalg.inv(normal)
-        shape = inverse @ np.add.reduceat(weighted[:, :, None] * rows[:, None], begins)
-        rows -= np.einsum("nk,nkj->nj", basis, shape[cell])
-        by_errors = rows[:, :-1]
-        covariance = np.linalg.inv(by_errors.T @ (by_errors * weight[:, None]) + np.diag(PRIOR**-2))
-        found = -covariance @ (by_errors.T @ (weight * rows[:, -1]))
-        off = rows @ np.append(found, 1.0)
-        q = (shape @ np.append(found, 1.0))[cell]
-        slopes = q[:, 1] + 2.0 * q[:, 2] * s
-        weights = huber_weights(off / np.sqrt(variance), NOISE_HUBER) ** 2
-    scores = np.add.reduceat((weight * off)[:, None] * by_errors, begins)
-    leverage = weight * np.einsum("nk,nkl,nl->n", basis, inverse[cell], basis)
-    middle = np.add.reduceat(table.t, begins) / counts
-    spread = clustered(middle, scores, covariance)
-    sigmas = np.sqrt(np.maximum(np.diag(covariance), np.diag(spread)))
-    slow, room = (shares * drift).sum(axis=0), np.maximum(1.0 - leverage, 0.1)
-    square = np.minimum(off**2 / (room * variance), 9.0) - slow / variance  # few outliers count for the noise
-    model = np.concatenate([shares, shares * ranges**2]).T
-    squares = scipy.optimize.nnls(model / variance[:, None], square)[0].reshape(2, 2).T
-    middle = np.quantile(ranges, (np.arange(BINS) + 0.5) / BINS)
-    lines = [line_through(middle, np.sqrt(np.maximum(a + b * middle**2, 1e-8))) for a, b in squares]
-    along = RayNoise(np.maximum(lines[0], (LEAST_NOISE[0], 0.0)))
-    across = RayNoise(np.maximum(lines[1], (0.0, LEAST_NOISE[1])))
-    return table, counts, found, sigmas, (along, across)
 
 
 def _frames(points: Array, weight: Array, begins: IntArray, counts: IntArray) -> tuple[Array, Array, Array]:
@@ -139,34 +81,72 @@ def _frames(points: Array, weight: Array, begins: IntArray, counts: IntArray) ->
     return tangents, (off * tangents).sum(axis=1), (off * left_of(tangents)).sum(axis=1)
 
 
-class LineMeasurement(Copyable):
-    """Measurement of noise by points of lines, in steps short enough for a perception cycle."""
+def _fitted(squares: Array, shares: Array, ranges: Array) -> Rays:
+    """Fit `sum_k share_k (a_k^2 + b_k^2 r^2)` to squares (n,) of residuals at ranges r (n,).
 
-    def __init__(self, cycles: Sequence[SeenCycle], found: MeasuredNoise) -> None:
-        """Begin with the cycles of a drive, and with what is known: the noise of the odometry at least.
+    The shares (2, n) are those of the noise along and across the ray.
+    """
+    model = np.concatenate([shares, shares * ranges**2])
+    variances = scipy.optimize.nnls(model.T, squares)[0].reshape(2, 2).T
+    at = np.quantile(ranges, (np.arange(BINS) + 0.5) / BINS)
+    along, across = (line_through(at, np.sqrt(np.maximum(a + b * at**2, 1e-8))) for a, b in variances)
+    along, across = np.maximum(along, (LEAST_NOISE[0], 0.0)), np.maximum(across, (0.0, LEAST_NOISE[1]))
+    return RayNoise(along), RayNoise(across)
 
-        Points count if they were seen in motion, up to a number that bounds the time of a round.
-        """
-        table = Sightings.of(cycles)
-        least = MIN_SPEED_SHARE * np.median([np.hypot(*one.twist[:2]) for one in cycles])
-        table = table.where(np.hypot(*table.twist[:, :2].T) > least)
-        self._points = table.where(slice(None, None, max(-(-len(table.t) // 4000), 1)))
-        self._found, self._noise = found, (found.along or FIRST_ALONG, found.across or FIRST_ACROSS)
-        self._errors, self._rounds = np.zeros(len(PRIOR)), 8
-        if found.along is not None:  # nearly converged
-            self._errors, self._rounds = np.array([*found.sensor, found.range_bend, 0.0]), 3
 
-    def advance(self) -> MeasuredNoise | None:
-        """Find cells, errors, noise and weights in turn; return what was found in the last round."""
-        walk = self._found.odometry * np.sqrt(self._found.interval)
-        found = fit(self._points, self._errors, self._noise, walk)
-        if found is None:
-            return self._found
-        table, counts, self._errors, sigmas, self._noise = found
-        self._rounds -= 1
-        if self._rounds:
-            return None
-        stamps = np.unique(self._points.t)
-        period, per_cycle = float(np.median(np.diff(stamps))), len(self._points.t) / len(stamps)
-        seen = int(np.median(counts)), period, per_cycle
-        return with_detections(self._found, self._noise, self._errors, sigmas, table.t, seen)
+def measured_by_lines(cycles: Sequence[SeenCycle], found: MeasuredNoise) -> Iterator[MeasuredNoise | None]:
+    """Measure noise and constants in steps short enough for a perception cycle: None after each, then both.
+
+    Start with the cycles of a drive and an estimate, which has the noise of the odometry at least. Points
+    count if they were seen in motion, up to a number that bounds the time of a step. Each round finds cells,
+    then parabolas and constants by least squares, and the noise that is left across the parabolas. The square
+    of what is left has the expectation `(1 - leverage) sum_k share_k (a_k^2 + b_k^2 r^2)`: the shares are
+    those of the directions along and across the ray in the normal, squared.
+    """
+    table, walk = Sightings.of(cycles), found.odometry * np.sqrt(found.interval)
+    least = MIN_SPEED_SHARE * np.median([np.hypot(*one.twist[:2]) for one in cycles])
+    moving = np.flatnonzero(np.hypot(*table.twist[:, :2].T) > least)
+    seen = table.where(moving[:: max(-(-len(moving) // 4000), 1)])
+    noise, again = (found.along or FIRST_ALONG, found.across or FIRST_ACROSS), found.along is not None
+    errors = np.array([*found.sensor, found.range_bend, 0.0]) if again else np.zeros(len(PRIOR))
+    for _ in range(3 if again else 8):  # nearly converged, or not
+        yield None
+        table, begins, counts = in_cells(seen, errors)
+        if len(table.t) < MIN_ROWS:
+            yield found
+            return
+        columns = derivatives_by_constants(table, np.repeat(begins, counts), table.point)
+        points = to_map(table.point, table.pose) + np.tensordot(columns, errors, 1)
+        axes, ranges = map_rays(table), np.hypot(*table.point.T)
+        middle = np.add.reduceat(table.t, begins) / counts
+        drift = np.array([np.full(len(ranges), walk[0] ** 2), walk[1] ** 2 + (walk[2] * ranges) ** 2])
+        drift *= np.abs(table.t - np.repeat(middle, counts))
+        variances = sigmas_by_range(noise, ranges) ** 2 + drift
+        tangents, s, y = _frames(points, 1.0 / variances.sum(axis=0), begins, counts)
+        basis, start = np.stack([np.ones(len(s)), s, s**2], axis=1), errors
+        slopes, weights = np.zeros(len(s)), np.ones(len(s))
+        for _ in range(4):  # with the slopes and weights of the iteration before
+            normals = left_of(tangents) - slopes[:, None] * tangents
+            shares = on_axes(normals, axes) ** 2
+            variance = (shares * variances).sum(axis=0)
+            weight = weights / variance
+            weighted, rows = basis * weight[:, None], np.einsum("ni,nij->nj", normals, columns)
+            rows = np.column_stack([rows, y - rows @ start])
+            normal = np.add.reduceat(weighted[:, :, None] * basis[:, None], begins) + np.diag(SHAPE)
+            inverse = np.linalg.inv(normal)
+            shape = inverse @ np.add.reduceat(weighted[:, :, None] * rows[:, None], begins)
+            rows -= np.einsum("nk,nkj->nj", basis, np.repeat(shape, counts, axis=0))
+            by_errors = rows[:, :-1]
+            covariance = np.linalg.inv(by_errors.T @ (by_errors * weight[:, None]) + np.diag(PRIOR**-2))
+            errors = -covariance @ (by_errors.T @ (weight * rows[:, -1]))
+            off = rows @ np.append(errors, 1.0)
+            q = np.repeat(shape @ np.append(errors, 1.0), counts, axis=0)
+            slopes = q[:, 1] + 2.0 * q[:, 2] * s
+            weights = huber_weights(off / np.sqrt(variance), NOISE_HUBER) ** 2
+        leverage = weight * np.einsum("nk,nkl,nl->n", basis, np.repeat(inverse, counts, axis=0), basis)
+        slow, room = (shares * drift).sum(axis=0), np.maximum(1.0 - leverage, 0.1)
+        square = np.minimum(off**2 / (room * variance), 9.0) - slow / variance  # outliers hardly count here
+        noise = _fitted(square, shares / variance, ranges)
+    spread = clustered(middle, np.add.reduceat((weight * off)[:, None] * by_errors, begins), covariance)
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), np.diag(spread)))
+    yield with_detections(found, noise, errors, sigmas, table.t, frequency(seen.t, counts))

@@ -1,10 +1,11 @@
 """Noise used in a drive: stated by the log, or measured on the drive so far."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib import import_module
+from itertools import tee
 from math import inf
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 
@@ -17,8 +18,8 @@ from pathspace_graph.io.results import NoiseSource, RunNoise
 from pathspace_graph.mapping.motion import MeasuredMotion
 from pathspace_graph.settings.mapper import MapperSettings
 
-from .line_noise import LineMeasurement
-from .measurement import Measurement, SeenCycle, twist_noise, without_repeats
+from .line_noise import measured_by_lines
+from .measurement import SeenCycle, measured_by_cones, twist_noise, without_repeats
 
 FIRST: Final = 8.0  # driving time before the first measurement of noise (s)
 AGAIN: Final = 1.5  # growth of the driving time between measurements
@@ -52,9 +53,16 @@ class NoiseLearner(Copyable):
         self._of_lines = of_lines
         if of_lines:
             import_module("scipy.optimize")  # 50 ms, which no cycle has to spare
-        self._measurement: Measurement | LineMeasurement | None = None
+        self._steps: Iterator[MeasuredNoise | None] | None = None  # of a measurement that is under way
         self._driven, self._due = 0.0, FIRST
         self._t: float | None = None
+
+    def copy(self) -> Self:
+        """Return a copy that can change independently; both take the steps of a measurement by themselves."""
+        other = super().copy()
+        if self._steps is not None:
+            self._steps, other._steps = tee(self._steps)
+        return other
 
     @property
     def is_learning(self) -> bool:
@@ -84,15 +92,15 @@ class NoiseLearner(Copyable):
         if self._t is not None and np.hypot(*motion.odometry.twist[:2]) > 0.3:  # m/s
             self._driven += min(detections.t - self._t, 1.0)
         self._t = detections.t
-        if self._measurement is None and self._driven >= self._due:
+        if self._steps is not None:
+            found = next(self._steps)
+            if found is not None:
+                self.measured, self._steps = found, None
+                return True
+        elif self._driven >= self._due:
             self._due = AGAIN * self._driven
-            twists = without_repeats(self._twists)
-            self._measurement = begun(self._cycles, twists, self.measured, of_lines=self._of_lines)
-        found = None if self._measurement is None else self._measurement.advance()
-        if found is None:
-            return False
-        self.measured, self._measurement = found, None
-        return True
+            self._steps = begun(self._cycles, self._twists, self.measured, of_lines=self._of_lines)
+        return False
 
     def for_check(self, detections: Detections, twist: Array) -> Detections:
         """Return detections for scan matching, corrected for significant constant errors."""
@@ -217,25 +225,21 @@ def _source(stated: bool, measured: bool, known: bool) -> NoiseSource:
 
 
 def begun(
-    cycles: Sequence[SeenCycle], odometry: Odometry, known: MeasuredNoise | None, *, of_lines: bool
-) -> Measurement | LineMeasurement | None:
+    cycles: Sequence[SeenCycle], twists: Sequence[Odometry], known: MeasuredNoise | None, *, of_lines: bool
+) -> Iterator[MeasuredNoise | None] | None:
     """Start a measurement on cones or on lines; None without a cycle, or without noise of the odometry."""
-    of_twists = twist_noise(odometry)
+    of_twists = twist_noise(*twists)
     if of_twists is None or len(cycles) == 0:
         return None
     sigma, interval = of_twists[0].min(axis=0), of_twists[1]
     found = known or MeasuredNoise(sigma, np.array(ASSUMED_DRIFT), interval)
     found = replace(found, odometry=sigma, interval=interval)
-    return (LineMeasurement if of_lines else Measurement)(cycles, found)
+    return (measured_by_lines if of_lines else measured_by_cones)(cycles, found)
 
 
 def measure_noise(
     cycles: Sequence[SeenCycle], odometry: Odometry, *, of_lines: bool = False
 ) -> MeasuredNoise | None:
     """Measure the noise of cones or of lines; None if not even the odometry's noise can be estimated."""
-    measurement = begun(cycles, odometry, None, of_lines=of_lines)
-    if measurement is None:
-        return None
-    while (found := measurement.advance()) is None:
-        pass
-    return found
+    steps = begun(cycles, [odometry], None, of_lines=of_lines)
+    return None if steps is None else next(found for found in steps if found is not None)

@@ -6,7 +6,7 @@ from beside the vehicle, and each cone gets the side of the row that it fits bet
 turn, so that the width of the track decides where the colours do not.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -124,15 +124,15 @@ class SideJudge(Copyable):
 
     def update(
         self, pose: Array, twists: Array, detections: Detections, *, in_lane: bool = False
-    ) -> Detections:
-        """Return the detections of a cycle, labelled by side.
+    ) -> IntArray:
+        """Return the labels (m,) of the detections of a cycle, by side.
 
         The pose (3,) is by dead reckoning, and the twists (k, 3) lead to it. In a lane of orange cones the
         vehicle is not on the track yet, and colours get no vote. What the colours mean is final after 30
         votes.
         """
         labels = detections.labels
-        unknown = int((labels == UNKNOWN).sum())
+        unknown = int(np.count_nonzero(labels == UNKNOWN))
         self._counts = 0.98 * self._counts + [len(labels) - unknown, unknown]
         total, sides = self._counts.sum(), np.full(len(labels), UNKNOWN)
         self.colourless = bool(total >= 6 and self._counts[1] > self.settings.colourless * total)
@@ -152,8 +152,7 @@ class SideJudge(Copyable):
         else:
             self._path = None  # a new path begins if it is needed again
         coloured = LEFT + RIGHT - labels if self.swapped else labels
-        given = np.where(labels == UNKNOWN, sides, coloured)
-        return detections if (given == labels).all() else replace(detections, labels=given)
+        return np.where(labels == UNKNOWN, sides, coloured)
 
     def _judge_colours(self, path: PathAhead) -> None:
         """Count the vote of each cone once, and swap colours by three votes and 2.5 times the others."""

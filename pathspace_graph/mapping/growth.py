@@ -9,7 +9,7 @@ import numpy as np
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
 from pathspace_graph.factors.se2 import path_lengths
-from pathspace_graph.labels import BOUNDARIES, NAMES, UNKNOWN
+from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.mapping import path
 from pathspace_graph.mapping.curve_map import CurveMap
 from pathspace_graph.mapping.path import SIDES, Candidates, End, PathAhead, chain, crosses
@@ -37,6 +37,7 @@ class Growth(Copyable):
         self._known: Mapping[int, float] = {}  # ends of curves that were known before the drive (m)
         self.taken_back = 0  # how often a curve was shortened
         self._full: frozenset[int] = frozenset()  # boundaries that have stopped growing
+        self._turn = BOUNDARIES  # order of the boundaries: the one that was extended last is the last one
         self._beside = dict.fromkeys(BOUNDARIES, np.zeros((0, 2)))
 
     def observe(self, track: CurveMap, new: slice, t: float) -> None:
@@ -49,22 +50,26 @@ class Growth(Copyable):
         self.tentative.add(points, covariances, detections.label[rows], t)
 
     def expand(self, smoother: CurveSmoother, path_ahead: PathAhead) -> tuple[frozenset[int], str]:
-        """Begin or extend each boundary; return the labels of the curves that were extended, and a notice."""
-        full, grown, track = self._full, set(), smoother.map
-        for label in BOUNDARIES:
+        """Begin boundaries or extend one of them; return the labels of those extended, and a notice.
+
+        Boundaries are extended in turn, one in a cycle, so that no cycle is slow.
+        """
+        full, grown, track = self._full, frozenset[int](), smoother.map
+        for label in self._turn:
             begins = self._known.get(label, -np.inf) - GROWTH_REACH
             if label not in track.state.boundaries:
                 self._begin(track, label, path_ahead)
             elif track.state.pose_u[label][-1] < begins or self._is_full(track, label, path_ahead):
                 continue
-            elif self._grow(smoother, label, path_ahead):
-                grown.add(label)
+            elif self._grow(smoother, label, path_ahead, may_extend=not grown):
+                grown |= {label}
+                self._turn = LEFT + RIGHT - label, label
         notices = list[str]()
         for label in sorted(self._full - full):
             boundary = track.state.boundaries[label]
             size, length = f"{boundary.size} control points", f"{boundary.confirmed_end:.3g} m"
             notices.append(f"the open {NAMES[label]} boundary grows no further, with {size} on {length}")
-        return frozenset(grown), "; ".join(notices)
+        return grown, "; ".join(notices)
 
     def wait_for(self, ends: Mapping[int, float]) -> None:
         """Let known curves grow only when the vehicle is near their ends (m), by label."""
@@ -83,12 +88,15 @@ class Growth(Copyable):
         state.locate(label, np.zeros(len(state.poses)))
         _relocate_poses(state, label, 0.0)
 
-    def _grow(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead) -> bool:
-        """Extend a curve; first take it back if its cones are out of order. Return whether it has changed."""
+    def _grow(self, smoother: CurveSmoother, label: int, path_ahead: PathAhead, *, may_extend: bool) -> bool:
+        """Extend a curve if it may; first take it back if its cones are out of order, and then extend it.
+
+        Return whether it has changed.
+        """
         track, boundary = smoother.map, smoother.map.state.boundaries[label]
         kept, self._beside[label] = check_order(boundary, path_ahead, self._beside[label])
         if kept == len(boundary.observed):
-            return self._extend(track, label, path_ahead, path.END_BEHIND)
+            return may_extend and self._extend(track, label, path_ahead, path.END_BEHIND)
         self._take_back(smoother, label, kept)
         from_u = boundary.confirmed_end
         self._extend(track, label, path_ahead, RECALL)
@@ -225,12 +233,12 @@ def _uncrossed(state: State, label: int, path_ahead: PathAhead, end: End, found:
         begin = boundary.confirmed_end - RECALL
         first = int(boundary.cone_parameters.searchsorted(begin))
         lines.append(boundary.observed[first : -1 if other == label else None])
-    before = end.position
-    for k, point in enumerate(found.points):
-        if any(len(line) > 1 and crosses(before, point[None], line)[0] for line in lines):
-            return np.arange(k)
-        before = point
-    return np.arange(len(found.points))
+    begins = np.concatenate([end.position[None], found.points[:-1]])
+    crossed = np.zeros(len(found.points), bool)
+    for line in lines:
+        if len(line) > 1:
+            crossed |= crosses(begins, found.points, line)
+    return np.flatnonzero(~np.logical_or.accumulate(crossed))
 
 
 def end_of(state: State, label: int, path_ahead: PathAhead, behind: float) -> End:

@@ -130,11 +130,10 @@ along_and_across: Final = kernels.along_and_across
 
 
 def crosses(begin: Array, ends: Array, line: Array) -> BoolArray:
-    """Whether each segment from `begin` (2,) to one of `ends` (k, 2) crosses a polyline (n, 2)."""
-    step, relative = ends - begin, line - begin
-    beside = step[:, :1] * relative[:, 1] - step[:, 1:] * relative[:, 0]
-    edge = np.diff(line, axis=0)
-    at_begin = edge[:, 1] * relative[:-1, 0] - edge[:, 0] * relative[:-1, 1]
+    """Whether segments from `begin`, (2,) or (k, 2), to `ends` (k, 2) cross a polyline (n, 2)."""
+    step, relative, edge = ends - begin, line - begin[..., None, :], line[1:] - line[:-1]
+    beside = step[:, :1] * relative[..., 1] - step[:, 1:] * relative[..., 0]
+    at_begin = edge[:, 1] * relative[..., :-1, 0] - edge[:, 0] * relative[..., :-1, 1]
     at_end = at_begin + edge[:, 0] * step[:, 1:] - edge[:, 1] * step[:, :1]
     parts = (beside[:, :-1] * beside[:, 1:] < 0.0) & (at_begin * at_end < 0.0)
     return np.asarray(parts.any(axis=1))

@@ -317,17 +317,39 @@ def test_a_learner_never_reads_ahead() -> None:
         np.testing.assert_array_equal(found.sensor, expected.sensor)
 
 
+def test_a_copy_takes_the_steps_of_a_measurement_by_itself() -> None:
+    """Copies from before and from within the first one know the same as the original after each cycle."""
+    log = cut(unstated(short_drive()), 110)
+    front_end, copies, known = FrontEnd(SETTINGS, log.noise), list[FrontEnd](), list[Array | None]()
+
+    def sensor(one: FrontEnd) -> Array | None:
+        return None if one.noise.measured is None else one.noise.measured.sensor
+
+    for cycle in split_odometry(log):
+        copies.append(front_end.copy())
+        front_end.update(*cycle)
+        known.append(sensor(front_end))
+    assert known[80] is None and known[-1] is not None
+    for k in (70, 84, 85, 90, 99):
+        for expected, cycle in list(zip(known, split_odometry(log), strict=True))[k:]:
+            copies[k].update(*cycle)
+            np.testing.assert_array_equal(sensor(copies[k]), expected)
+
+
 def test_noise_is_measured_after_8_s_of_driving_and_after_half_as_much_again_each_time() -> None:
-    log, on = unstated(short_drive()), list[float]()
+    log, begins = unstated(short_drive()), list[float]()
     front_end = FrontEnd(SETTINGS, log.noise)
     for odometry, cycle in split_odometry(log):
-        before = front_end.noise.measured
+        noise = front_end.noise
+        before, idle = noise.measured, noise._steps is None
         front_end.update(odometry, cycle)
-        if front_end.noise.measured is not before:
-            assert front_end.noise.measured is not None
-            on.append(front_end.noise.measured.seconds)
-            np.testing.assert_array_equal(front_end._motion.noise.white, front_end.noise.measured.odometry)
-    np.testing.assert_allclose(on, [8.0, 12.0, 18.0], atol=0.5)
+        if idle and noise._steps is not None:
+            begins.append(cycle.t)
+        if noise.measured is not before:
+            assert noise.measured is not None
+            assert noise.measured.seconds == pytest.approx(begins[-1], abs=0.7)
+            np.testing.assert_array_equal(front_end._motion.noise.white, noise.measured.odometry)
+    np.testing.assert_allclose(begins, [8.0, 12.0, 18.0], atol=0.5)
 
 
 def test_stated_noise_stays_unless_errors_stay() -> None:

@@ -19,9 +19,9 @@ from pathspace_graph.front_end.gate import Gate
 
 NOT_ESTIMATED = (
     *("lap_seconds", "late_cycles", "failures", "_unused"),
-    *("_first_pose", "_curves", "_whole_curves"),
+    *("_first_pose", "_curves", "_whole_curves", "_steps"),
 )
-"""These attributes are times of the machine, what is kept for a failure, and caches."""
+"""These attributes are times of the machine, what is kept for a failure, caches, and steps to come."""
 
 COMPILED: dict[type, Callable[[Any], Any]] = {
     KDTree: lambda tree: np.array(tree.data),
