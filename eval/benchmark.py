@@ -29,7 +29,14 @@ from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.mapping.motion import integrate_odometry
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.run import ObservedCycle, run_online, split_odometry, timed_update, timed_wait
+from pathspace_graph.run import (
+    ObservedCycle,
+    run_online,
+    spared_by_collector,
+    split_odometry,
+    timed_update,
+    timed_wait,
+)
 from pathspace_graph.settings.mapper import CONES_MIN, MapperSettings, ScalingSettings
 from pathspace_graph.sim.sensor import LINE, LineSettings, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
@@ -272,7 +279,7 @@ def update_times(
     running = {(k, name): make_online(name, mapper, log) for k, log in enumerate(logs) for name in estimators}
     closed, last = dict.fromkeys(running, False), {key: deque[float]([], JUDGED) for key in running}
     rows = list[tuple[str, float, float, int]]()
-    with threadpool_limits(limits=1):
+    with threadpool_limits(limits=1), spared_by_collector():
         for number, cycles in enumerate(zip(*map(split_odometry, logs), strict=True)):
             order = deque(running)
             order.rotate(-number)
