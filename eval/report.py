@@ -22,7 +22,17 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
 from . import cars
-from .benchmark import QUICK, RIVAL, SPEED, measure_scaling, scaling_table, speed_on
+from .benchmark import (
+    DRIVES,
+    QUICK,
+    QUICK_DRIVES,
+    RIVAL,
+    SPEED,
+    measure_drives,
+    measure_scaling,
+    scaling_table,
+    speed_on,
+)
 from .experiment import faults, tables
 from .experiment.run import make_plan, origin_of, rows_of, run_study
 from .experiment.study import Study, StudyDrive, find_study, read_study_file
@@ -99,14 +109,16 @@ class ReportPlan:
         return {"": cars.known_table(drives), "odds": cars.odds_table(searches)}
 
     def speed(self, _: Path) -> Tables:
-        """Time every estimator in turn on the same cycles."""
+        """Time every estimator in turn on the same cycles; then single drives, also of a real car."""
         seeds, laps = ((0,), 1) if self.quick else ((0, 1, 2), 5)
+        drives = {**(QUICK_DRIVES if self.quick else DRIVES)}
+        drives |= {folder.name: ("log", folder, 1) for folder in self.real}
         rows = []
         for seed in seeds:
             track = generate_track(np.random.default_rng(seed))
             log = simulate(track, SimulationSettings(laps=laps), seed)
             rows.append({"track": seed, **speed_on(log, MapperSettings())})
-        return {"": by_metric({"measured": pd.DataFrame(rows)}, SPEED)}
+        return {"": by_metric({"measured": pd.DataFrame(rows)}, SPEED)} | measure_drives(drives)
 
     def real_logs(self, folder: Path) -> Tables:
         if not self.real:
@@ -151,12 +163,13 @@ def write_report(
     every = QUICKEST if plan.quick else [name for name in EXPERIMENTS if name != "real" or plan.real]
     for name in names or every:
         run = origin_of(__name__)
-        given = {"accuracy": " --tracks TRACKS" * bool(plan.tracks), "real": " --real LOGS"}.get(name, "")
+        given = {"accuracy": " --tracks TRACKS" * bool(plan.tracks), "real": " --real LOGS"}
+        given["speed"] = given["real"] * bool(plan.real)
         about = {
             "commit": run["commit"],
             "machine": run["processor"],
             "date": run["date"][:10],
-            "command": f"pathspace-graph report --only {name}{given}{' --quick' * plan.quick}",
+            "command": f"pathspace-graph report --only {name}{given.get(name, '')}{' --quick' * plan.quick}",
         }
         for part, table in EXPERIMENTS[name](plan, folder / name).items():
             file = folder / f"{'_'.join(filter(None, (name, part)))}.csv"
