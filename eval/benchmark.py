@@ -72,7 +72,7 @@ from .metrics.measures import UNKNOWN, Metric, figure, figures, lap_times, versi
 
 # --- beside ISAM2 ----------------------------------------------------------------------------------------
 
-RIVAL: Final = "landmark-fixed-lag"  # estimator that gets the same cycles in turn
+RIVAL: Final = "landmark-fixed-lag"  # estimator that gets the same cycles in turn, and stands in the demo
 WARM_UP: Final = 50  # number of cycles after which the window is full, before which the means do not begin
 SPEED: Final = (  # of a drive
     Metric("mean_by_isam2", "mean update relative to iSAM2 with known data association", digits=2),
@@ -198,7 +198,6 @@ DRIVES: Final[Drives] = {
     "ring of 5 km, 2 laps": ("ring", 2000, 2),
 }
 QUICK_DRIVES: Final[Drives] = {"road of 200 m": ("road", 80, 1), "ring of 200 m, 2 laps": ("ring", 80, 2)}
-MOST_LAPS: Final = 5  # most laps of a drive that is also solved as a batch
 CAUSES: Final[Mapping[Callable[..., Any], str]] = {
     Drive.take: "swap of the map",
     Drive.begin_batch: "start of a batch",
@@ -281,7 +280,7 @@ def figures_of(kind: str, of: int | Path, laps: int) -> dict[str, Any]:
         "causes": dict(sorted(shares.items(), key=lambda item: -item[1])),
         "memory": 1e-3 * float(peak[1]) if peak else math.nan,
         "libraries": libraries,
-        "batch": batch_seconds(log, settings) if laps <= MOST_LAPS else math.nan,
+        "batch": batch_seconds(log, settings) if laps <= 5 else math.nan,
     }
 
 
