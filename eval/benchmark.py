@@ -32,7 +32,7 @@ from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.console import progress
-from pathspace_graph.estimators import DEFAULT_BATCH, make_batch, make_online, module_of
+from pathspace_graph.estimators import DEFAULT_BATCH, make_batch, make_online, module_of, settings_of
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.se2 import compose, left_of, to_map
@@ -237,7 +237,7 @@ def figures_of(kind: str, of: int | Path, laps: int) -> dict[str, Any]:
         log = simulate(generate_track(np.random.default_rng(of)), SimulationSettings(laps=laps), of)
     else:
         log = fast_drive(open_road(of, GAP) if kind == "road" else closed_road(of), laps)
-    settings, profile, slowest = MapperSettings(), cProfile.Profile(time.thread_time), -1
+    settings, profile, slowest = settings_of(MapperSettings(), log), cProfile.Profile(time.thread_time), -1
     collected, begun = [0.0], 0.0
 
     def collect(phase: str, _: dict[str, int]) -> None:
@@ -323,19 +323,33 @@ def shares_of(report: str) -> dict[str, float]:
     return {name: shares[name] / total for name in LIBRARIES} if shares else {}
 
 
-def measure_drives(drives: Drives) -> dict[str, TextTable]:
-    """Measure each drive in its own process; return the tables `drives` and, with `perf`, `libraries`."""
-    rows = dict[str, dict[str, Any]]()
+def measure_speed(quick: bool, logs: Sequence[Path] = ()) -> dict[str, TextTable]:
+    """Time estimators in turn on tracks; then measure single drives, also of logs, each in its own process.
+
+    The tables are that of `SPEED`, `drives` and, with `perf`, `libraries`.
+    """
+    for folder in logs:
+        read_log(folder)  # so that a wrong one is an error now
+    beside, rows = list[dict[str, float]](), dict[str, dict[str, Any]]()
+    for seed in (0,) if quick else (0, 1, 2):
+        laps = SimulationSettings(laps=1 if quick else 5)
+        log = simulate(generate_track(np.random.default_rng(seed)), laps, seed)
+        beside.append({"track": seed, **speed_on(log, MapperSettings())})
+    drives = {**(QUICK_DRIVES if quick else DRIVES), **{folder.name: ("log", folder, 1) for folder in logs}}
     with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as processes:
         measured = processes.map(figures_of, *zip(*drives.values(), strict=True))
         with progress("single drives", len(drives)) as advance:
             for name in drives:
                 rows[name] = next(measured)
                 advance()
-    parts = {name: pd.DataFrame([row["libraries"]]) for name, row in rows.items() if row["libraries"]}
+    found = {"": by_metric({"measured": pd.DataFrame(beside)}, SPEED), "drives": drives_table(rows)}
+    shares = {
+        name: pd.DataFrame([row["libraries"]]).assign(track=name)
+        for name, row in rows.items()
+        if row["libraries"]
+    }
     titles = [Metric(name, name, "%", 0) for name in LIBRARIES]
-    shares = {name: part.assign(track=name) for name, part in parts.items()}
-    return {"drives": drives_table(rows)} | ({"libraries": by_metric(shares, titles)} if parts else {})
+    return found | ({"libraries": by_metric(shares, titles)} if shares else {})
 
 
 def drives_table(rows: Mapping[str, Mapping[str, Any]]) -> TextTable:

@@ -11,28 +11,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import pandas as pd
 
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.io.parsing import parse_toml, read_text
-from pathspace_graph.settings.mapper import MapperSettings, ScalingSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track_generator import generate_track
+from pathspace_graph.settings.mapper import ScalingSettings
 
 from . import cars
-from .benchmark import (
-    DRIVES,
-    QUICK,
-    QUICK_DRIVES,
-    RIVAL,
-    SPEED,
-    measure_drives,
-    measure_scaling,
-    scaling_table,
-    speed_on,
-)
+from .benchmark import QUICK, RIVAL, measure_scaling, measure_speed, scaling_table
 from .experiment import faults, tables
 from .experiment.run import make_plan, origin_of, rows_of, run_study
 from .experiment.study import Study, StudyDrive, find_study, read_study_file
@@ -107,16 +94,7 @@ class ReportPlan:
         return {"": cars.known_table(drives), "odds": cars.odds_table(searches)}
 
     def speed(self, _: Path) -> Tables:
-        """Time every estimator in turn on the same cycles; then single drives, also of a real car."""
-        seeds, laps = ((0,), 1) if self.quick else ((0, 1, 2), 5)
-        drives = {**(QUICK_DRIVES if self.quick else DRIVES)}
-        drives |= {folder.name: ("log", folder, 1) for folder in self.real}
-        rows = []
-        for seed in seeds:
-            track = generate_track(np.random.default_rng(seed))
-            log = simulate(track, SimulationSettings(laps=laps), seed)
-            rows.append({"track": seed, **speed_on(log, MapperSettings())})
-        return {"": by_metric({"measured": pd.DataFrame(rows)}, SPEED)} | measure_drives(drives)
+        return measure_speed(self.quick, self.real)
 
     def real_logs(self, folder: Path) -> Tables:
         if not self.real:

@@ -16,7 +16,7 @@ import pytest
 from scipy.spatial import KDTree
 
 from pathspace_graph import cli
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval import benchmark
 from pathspace_graph.eval.benchmark import (
     CAUSES,
@@ -34,6 +34,7 @@ from pathspace_graph.eval.benchmark import (
     drives_table,
     figures_of,
     measure_scaling,
+    measure_speed,
     open_road,
     scaling_table,
     seconds_at,
@@ -284,6 +285,18 @@ def test_a_collection_within_an_update_is_a_cause(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(benchmark.FixedLagMapper, "update", collecting)
     assert next(iter(figures_of("road", 20, 1)["causes"])) == "garbage collection"
+
+
+@pytest.mark.slow
+def test_speed_is_measured_beside_rivals_and_of_single_drives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmark, "QUICK_DRIVES", {"a road": ("road", 20, 1)})
+    found = measure_speed(True)
+    assert len(found[""].frame) == len(SPEED)
+    assert [row["drive"] for row in found["drives"].records()] == ["a road"]
+    with pytest.raises(InputError, match="expected a log folder"):  # before anything is driven
+        measure_speed(True, [tmp_path / "none"])
 
 
 def test_a_drive_s_row_names_what_took_over_a_fifth_of_its_slowest_update() -> None:
