@@ -1,15 +1,26 @@
-"""The online mapper's speed: beside GTSAM's ISAM2 on a drive, and against map size, detections and laps.
+"""The mapper's speed: beside GTSAM's ISAM2, its slowest cycles and why, and against map size and detections.
 
 Estimators get every cycle in turn, in one process with one BLAS thread, so that what slows the machine down
-slows all alike. All times but that of the batch are processor times of the thread.
+slows all alike. All times but that of the batch of the open lap are processor times of the thread.
 """
 
+import cProfile
+import gc
 import math
+import os
+import re
+import shutil
+import signal
+import subprocess
+import tempfile
 import time
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from itertools import cycle
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,30 +32,47 @@ from scipy.stats import linregress
 from threadpoolctl import threadpool_limits
 
 from pathspace_graph.console import progress
-from pathspace_graph.estimators import make_online, module_of
+from pathspace_graph.estimators import DEFAULT_BATCH, make_batch, make_online, module_of, settings_of
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.noise import ray_sigmas
 from pathspace_graph.factors.se2 import compose, left_of, to_map
+from pathspace_graph.front_end.noise import NoiseLearner
 from pathspace_graph.io.files import atomic_folder, write_json
 from pathspace_graph.io.log import Detections, Log, Odometry
+from pathspace_graph.io.log_files import read_log
+from pathspace_graph.loop.closed import Search
+from pathspace_graph.loop.closing import fix_gauge
+from pathspace_graph.loop.drive import Drive
+from pathspace_graph.loop.open import ReturnFinder, Revisits
+from pathspace_graph.mapping.growth import Growth
 from pathspace_graph.mapping.motion import integrate_odometry
+from pathspace_graph.mapping.road import Road
+from pathspace_graph.mapping.smoother import CurveSmoother
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.run import ObservedCycle, run_online, split_odometry, timed_update, timed_wait
+from pathspace_graph.run import (
+    ObservedCycle,
+    run_online,
+    spared_by_collector,
+    split_odometry,
+    timed_update,
+    timed_wait,
+)
 from pathspace_graph.settings.mapper import CONES_MIN, MapperSettings, ScalingSettings
 from pathspace_graph.sim.sensor import LINE, LineSettings, SensorSettings
 from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import Track, along_polyline, arc_lengths, unit
+from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.sim.vehicle import VehicleSettings
 
 from .experiment.run import code_from, rows_of
-from .experiment.tables import TextTable, write_csv
+from .experiment.tables import TextTable, by_metric, write_csv
 from .figures import drawing
 from .metrics.accuracy import mean_of
 from .metrics.measures import UNKNOWN, Metric, figure, figures, lap_times, versions
 
 # --- beside ISAM2 ----------------------------------------------------------------------------------------
 
-RIVAL: Final = "landmark-fixed-lag"  # estimator that gets the same cycles in turn
+RIVAL: Final = "landmark-fixed-lag"  # estimator that gets the same cycles in turn, and stands in the demo
 WARM_UP: Final = 50  # number of cycles after which the window is full, before which the means do not begin
 SPEED: Final = (  # of a drive
     Metric("mean_by_isam2", "mean update relative to iSAM2 with known data association", digits=2),
@@ -56,6 +84,7 @@ SPEED: Final = (  # of a drive
     Metric("swap", "update that swaps the map", "ms", 1),
     Metric("slowest_other", "slowest of all other updates", "ms", 1),
     Metric("solve", "batch of the open lap, in its own process", "s", 1),
+    Metric("batch", "the whole drive as a batch", "s", 1),
 )
 
 
@@ -152,8 +181,186 @@ def speed_on(log: Log, settings: MapperSettings) -> dict[str, float]:
     found = {f"mean_by_{name}": mean_of(np.array(ours[WARM_UP:])) / of for name, of in warm.items()}
     found |= {"p99_by_isam2": p99 / p99_isam2, "mean": float(np.mean(ours)), "p99": p99}
     found["slowest_other"] = float(np.delete(ours, [*at.values()]).max())
-    found |= {name: ours[number] for name, number in at.items()}
+    found |= {name: ours[number] for name, number in at.items()} | {"batch": batch_seconds(log, settings)}
     return found | ({"solve": mapper.lap_seconds} if "swap" in at else {})
+
+
+# --- single drives: the slowest cycle and its cause, libraries, memory, batch -------------------------------
+
+Drives = Mapping[str, tuple[str, int | Path, int]]
+"""Kind of each drive by its name, number of the generated track or of cones or folder of a log, and laps."""
+DRIVES: Final[Drives] = {
+    **{f"track {number}, 5 laps": ("track", number, 5) for number in range(3)},
+    "track 0, 300 laps": ("track", 0, 300),
+    "road of 1 km": ("road", 400, 1),
+    "road of 5 km": ("road", 2000, 1),
+    "ring of 1 km, 2 laps": ("ring", 400, 2),
+    "ring of 5 km, 2 laps": ("ring", 2000, 2),
+}
+QUICK_DRIVES: Final[Drives] = {"road of 200 m": ("road", 80, 1), "ring of 200 m, 2 laps": ("ring", 80, 2)}
+CAUSES: Final[Mapping[Callable[..., Any], str]] = {
+    Drive.take: "swap of the map",
+    Drive.begin_batch: "start of a batch",
+    fix_gauge: "fixing of the gauge",
+    ReturnFinder.find: "search for a place",
+    Revisits.find: "search for a place",
+    Search.find: "search for a place",
+    NoiseLearner.observe: "measurement of the noise",
+    Growth.expand: "growth",
+    CurveSmoother.deactivate_distant: "choice of the active part of the map",
+    Road.classify: "association",
+    Road.update: "Gauss-Newton step",
+    Road.marginalize: "marginalization",
+}
+"""What happens in a cycle, by functions of which none calls another."""
+LIBRARIES: Final = {  # by a pattern of the shared object and the symbol, the first that fits
+    "Python": "python3",
+    "kernels": r"^_kernels",
+    "BLAS": "blas",
+    "GTSAM": "gtsam|metis|boost",
+    "numpy": "umath|mtrand|_mt19937|numpy",
+    "malloc": r"^libc\..*(alloc|free|chunk|brk)|gnu_cxx|operator (new|delete)",
+    "rest": "",
+}
+
+
+def figures_of(kind: str, of: int | Path, laps: int) -> dict[str, Any]:
+    """Map a drive online in this process, which should be a new one; return a row of `drives_table`.
+
+    A second run of the same cycles profiles the slowest one; the first cycle does not count. `causes` are the
+    shares of its update that `CAUSES` and garbage collection took. `memory` (MB) is the most that the
+    process has had, with the log; NaN except on Linux.
+    """
+    if isinstance(of, Path):
+        log = read_log(of)
+    elif kind == "track":
+        log = simulate(generate_track(np.random.default_rng(of)), SimulationSettings(laps=laps), of)
+    else:
+        log = fast_drive(open_road(of, GAP) if kind == "road" else closed_road(of), laps)
+    settings, profile, slowest = settings_of(MapperSettings(), log), cProfile.Profile(time.thread_time), -1
+    collected, begun = [0.0], 0.0
+
+    def collect(phase: str, _: dict[str, int]) -> None:
+        nonlocal begun
+        now = time.thread_time()
+        if phase == "stop":
+            collected[-1] += now - begun
+        begun = now
+
+    def observe(observed: ObservedCycle) -> None:
+        collected.append(0.0)
+        if observed.number == slowest - 1:
+            profile.enable()
+        elif observed.number == slowest:
+            profile.disable()
+
+    gc.callbacks.append(collect)
+    try:
+        with library_shares() as libraries:
+            mapper = FixedLagMapper(settings, log.noise)
+            run = run_online(log, mapper, observers=[observe], outlines=True)
+    finally:
+        gc.callbacks.remove(collect)
+    status = Path("/proc/self/status")  # `getrusage` has the memory of the parent, where that is more
+    peak = re.search(r"VmHWM:\s+(\d+) kB", status.read_text()) if status.exists() else None
+    seconds = np.array([record.processor for record in run.cycles])
+    slowest = 1 + int(seconds[1:].argmax())
+    shares = defaultdict[str, float](float, {"garbage collection": collected[slowest] / seconds[slowest]})
+    until = replace(log, cycles=log.cycles[: slowest + 1], truth=None)
+    run_online(until, FixedLagMapper(settings, log.noise), observers=[observe], outlines=True)
+    took = {entry.code: entry.totaltime for entry in profile.getstats()}
+    for function, cause in CAUSES.items():
+        shares[cause] += took.get(function.__code__, 0.0) / took[FixedLagMapper.update.__code__]
+    stages = run.cycles[slowest].stages
+    return {
+        "mean": 1e3 * seconds.mean(),
+        "p99": 1e3 * np.quantile(seconds, 0.99),
+        "slowest": 1e3 * seconds[slowest],
+        "stage": max(stages, key=stages.__getitem__),
+        "causes": dict(sorted(shares.items(), key=lambda item: -item[1])),
+        "memory": 1e-3 * float(peak[1]) if peak else math.nan,
+        "libraries": libraries,
+        "batch": batch_seconds(log, settings) if laps <= 5 else math.nan,
+    }
+
+
+def batch_seconds(log: Log, settings: MapperSettings) -> float:
+    """Solve a whole drive as a batch; return the processor time (s)."""
+    begin = time.thread_time()
+    make_batch(DEFAULT_BATCH, settings, log).solve(log)
+    return time.thread_time() - begin
+
+
+@contextmanager
+def library_shares() -> Iterator[dict[str, float]]:
+    """Sample this process with Linux' `perf`; yield the shares of `LIBRARIES`, known at the end.
+
+    Without `perf`, or where it is not permitted, there are none.
+    """
+    shares, perf = dict[str, float](), shutil.which("perf")
+    if perf is None:
+        yield shares
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "perf.data"
+        command = [perf, "record", "-q", "-F", "499", "-o", str(file), "-p", str(os.getpid())]
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as sampler:
+            try:
+                yield shares
+            finally:
+                sampler.send_signal(signal.SIGINT)
+        command = [perf, "report", "-i", str(file), "--stdio", "-t", ";", "--sort", "dso,symbol"]
+        shares |= shares_of(subprocess.run(command, capture_output=True, text=True, check=False).stdout)
+
+
+def shares_of(report: str) -> dict[str, float]:
+    """Add up the lines `12.34%;shared object;[.] symbol` of a report of `perf` to shares of `LIBRARIES`."""
+    shares = defaultdict[str, float](float)
+    for percent, of in re.findall(r"^ *([\d.]+)% *;(.*)$", report, flags=re.MULTILINE):
+        library = next(name for name, pattern in LIBRARIES.items() if re.search(pattern, of))
+        shares[library] += float(percent)
+    total = sum(shares.values())
+    return {name: shares[name] / total for name in LIBRARIES} if shares else {}
+
+
+def measure_speed(quick: bool, logs: Sequence[Path] = ()) -> dict[str, TextTable]:
+    """Time estimators in turn on tracks; then measure single drives, also of logs, each in its own process.
+
+    The tables are that of `SPEED`, `drives` and, with `perf`, `libraries`.
+    """
+    for folder in logs:
+        read_log(folder)  # so that a wrong one is an error now
+    beside, rows = list[dict[str, float]](), dict[str, dict[str, Any]]()
+    for seed in (0,) if quick else (0, 1, 2):
+        laps = SimulationSettings(laps=1 if quick else 5)
+        log = simulate(generate_track(np.random.default_rng(seed)), laps, seed)
+        beside.append({"track": seed, **speed_on(log, MapperSettings())})
+    drives = {**(QUICK_DRIVES if quick else DRIVES), **{folder.name: ("log", folder, 1) for folder in logs}}
+    with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as processes:
+        measured = processes.map(figures_of, *zip(*drives.values(), strict=True))
+        with progress("single drives", len(drives)) as advance:
+            for name in drives:
+                rows[name] = next(measured)
+                advance()
+    found = {"": by_metric({"measured": pd.DataFrame(beside)}, SPEED), "drives": drives_table(rows)}
+    shares = {
+        name: pd.DataFrame([row["libraries"]]).assign(track=name)
+        for name, row in rows.items()
+        if row["libraries"]
+    }
+    titles = [Metric(name, name, "%", 0) for name in LIBRARIES]
+    return found | ({"libraries": by_metric(shares, titles)} if shares else {})
+
+
+def drives_table(rows: Mapping[str, Mapping[str, Any]]) -> TextTable:
+    """Return a row for each drive: its updates, the slowest with what took over a fifth, memory, batch."""
+    header = ("drive", "mean update [ms]", "p99 [ms]", "slowest [ms]", "stage", "cause", "memory [MB]")
+    texts = []
+    for name, row in rows.items():
+        times = figures([row["mean"], row["p99"], row["slowest"]], 1)
+        causes = ", ".join(f"{cause} {share:.0%}" for cause, share in row["causes"].items() if share > 0.2)
+        texts.append((name, *times, row["stage"], causes, *figures([row["memory"], row["batch"]], 0, 1)))
+    return TextTable.of((*header, "as a batch [s]"), texts)
 
 
 # --- sweeps ----------------------------------------------------------------------------------------------
@@ -177,6 +384,12 @@ QUICK: Final = ScalingSettings(  # takes less than a minute; its slopes mean lit
     laps_cones=60,
     budget=0.1,
 )
+
+
+def fast_drive(track: Track, laps: int = 1, **sensing: Any) -> Log:
+    """Simulate a drive at up to 20 m/s."""
+    vehicle = VehicleSettings(speed_max=20.0, speed_start=20.0, acceleration_lateral=9.0)
+    return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, **sensing), SEED)
 
 
 def open_road(cones: int, gap: float) -> Track:
@@ -217,13 +430,8 @@ def sweep_drives(sweep: str, settings: ScalingSettings) -> list[tuple[Log, Array
     A long road as its cones are seen, a short dense one with so many detections of each cycle, or a closed
     one. Numbers of cones are the geometric means of intervals.
     """
-
-    def drive(track: Track, laps: int = 1, **sensing: Any) -> Log:
-        vehicle = VehicleSettings(speed_max=20.0, speed_start=20.0, acceleration_lateral=9.0)
-        return simulate(track, SimulationSettings(laps=laps, vehicle=vehicle, **sensing), SEED)
-
     if sweep == CONES:
-        log = drive(open_road(int(settings.cones_max), GAP))
+        log = fast_drive(open_road(int(settings.cones_max), GAP))
         assert log.truth is not None
         assert log.truth.associations is not None
         ends = np.cumsum([len(cycle.labels) for cycle in log.cycles])
@@ -236,7 +444,10 @@ def sweep_drives(sweep: str, settings: ScalingSettings) -> list[tuple[Log, Array
         return [(until_seen, middles[np.searchsorted(edges, seen[:count], side="right")])]
     if sweep == READINGS:
         road, rng = open_road(settings.readings_cones, 1.0), np.random.default_rng(SEED)
-        dense, drives = drive(road, sensor=SensorSettings(range_max=DENSE_RANGE)), list[tuple[Log, Array]]()
+        dense, drives = (
+            fast_drive(road, sensor=SensorSettings(range_max=DENSE_RANGE)),
+            list[tuple[Log, Array]](),
+        )
         for wanted in settings.readings:
             cycles = list[Detections]()
             for detected in dense.cycles:  # as many at random, or all where there are fewer
@@ -250,11 +461,11 @@ def sweep_drives(sweep: str, settings: ScalingSettings) -> list[tuple[Log, Array
         return drives
     closed = closed_road(settings.laps_cones)
     if sweep == LAPS:
-        log = drive(closed, settings.laps)
+        log = fast_drive(closed, settings.laps)
         lap = 1.0 + np.searchsorted(lap_times(log), [seen.t for seen in log.cycles])
         return [(log, np.where(lap <= settings.laps, lap, np.nan))]
     # a spacing (m) that gives so many points
-    log = drive(closed, 2, sensor=replace(LINE, range_max=DENSE_RANGE), line=LineSettings(0.2))
+    log = fast_drive(closed, 2, sensor=replace(LINE, range_max=DENSE_RANGE), line=LineSettings(0.2))
     return [(log, np.full(len(log.cycles), float(LINE_POINTS)))]
 
 
@@ -272,7 +483,7 @@ def update_times(
     running = {(k, name): make_online(name, mapper, log) for k, log in enumerate(logs) for name in estimators}
     closed, last = dict.fromkeys(running, False), {key: deque[float]([], JUDGED) for key in running}
     rows = list[tuple[str, float, float, int]]()
-    with threadpool_limits(limits=1):
+    with threadpool_limits(limits=1), spared_by_collector():
         for number, cycles in enumerate(zip(*map(split_odometry, logs), strict=True)):
             order = deque(running)
             order.rotate(-number)

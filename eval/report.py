@@ -11,18 +11,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import pandas as pd
 
 from pathspace_graph.errors import SettingsError, check_name
 from pathspace_graph.estimators import DEFAULT_BATCH, DEFAULT_ONLINE
 from pathspace_graph.io.parsing import parse_toml, read_text
-from pathspace_graph.settings.mapper import MapperSettings, ScalingSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
-from pathspace_graph.sim.track_generator import generate_track
+from pathspace_graph.settings.mapper import ScalingSettings
 
 from . import cars
-from .benchmark import QUICK, RIVAL, SPEED, measure_scaling, scaling_table, speed_on
+from .benchmark import QUICK, RIVAL, measure_scaling, measure_speed, scaling_table
 from .experiment import faults, tables
 from .experiment.run import make_plan, origin_of, rows_of, run_study
 from .experiment.study import Study, StudyDrive, find_study, read_study_file
@@ -32,8 +29,6 @@ from .metrics.reference import landmark_rmse, solve_oracle_landmarks, truth_of
 
 FILE: Final = Path(__file__).with_suffix(".toml")
 STUDIES: Final = parse_toml(read_text(FILE), FILE)
-QUICKEST: Final = ("accuracy", "skidpad", "camera", "faults", "robust", "speed", "scale")
-"""Experiments of a quick report: the others have no table of their own kind."""
 Tables = dict[str, TextTable]  # of an experiment, by what follows its name; empty for the one of that name
 
 
@@ -99,14 +94,7 @@ class ReportPlan:
         return {"": cars.known_table(drives), "odds": cars.odds_table(searches)}
 
     def speed(self, _: Path) -> Tables:
-        """Time every estimator in turn on the same cycles."""
-        seeds, laps = ((0,), 1) if self.quick else ((0, 1, 2), 5)
-        rows = []
-        for seed in seeds:
-            track = generate_track(np.random.default_rng(seed))
-            log = simulate(track, SimulationSettings(laps=laps), seed)
-            rows.append({"track": seed, **speed_on(log, MapperSettings())})
-        return {"": by_metric({"measured": pd.DataFrame(rows)}, SPEED)}
+        return measure_speed(self.quick, self.real)
 
     def real_logs(self, folder: Path) -> Tables:
         if not self.real:
@@ -148,15 +136,18 @@ def write_report(
     """Run experiments, by default all that the plan has logs for; write and yield each table."""
     for name in names:
         check_name(name, EXPERIMENTS, "--only: expected an experiment")
-    every = QUICKEST if plan.quick else [name for name in EXPERIMENTS if name != "real" or plan.real]
+    every = [name for name in EXPERIMENTS if name != "real" or plan.real]
+    if plan.quick:  # the others have no table of their own kind
+        every = ["accuracy", "skidpad", "camera", "faults", "robust", "speed", "scale"]
     for name in names or every:
         run = origin_of(__name__)
-        given = {"accuracy": " --tracks TRACKS" * bool(plan.tracks), "real": " --real LOGS"}.get(name, "")
+        given = {"accuracy": " --tracks TRACKS" * bool(plan.tracks), "real": " --real LOGS"}
+        given["speed"] = given["real"] * bool(plan.real)
         about = {
             "commit": run["commit"],
             "machine": run["processor"],
             "date": run["date"][:10],
-            "command": f"pathspace-graph report --only {name}{given}{' --quick' * plan.quick}",
+            "command": f"pathspace-graph report --only {name}{given.get(name, '')}{' --quick' * plan.quick}",
         }
         for part, table in EXPERIMENTS[name](plan, folder / name).items():
             file = folder / f"{'_'.join(filter(None, (name, part)))}.csv"

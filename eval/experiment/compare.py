@@ -28,9 +28,6 @@ from .study import Study, log_folders
 from .tables import TextTable, estimate, write_csv
 
 MARKER: Final = "comparison.json"  # file by which a comparison's folder is recognized
-WITHOUT_TRUTH: Final = (  # metrics that say something of a log without true cones
-    *("size", "closed_at_end", "end_off", "crossings", "reported_degraded", "reported_lost", "ms_mean"),
-)
 
 
 def plan_of(
@@ -100,7 +97,16 @@ def compare(plan: Plan, folder: Path, **how: Any) -> Comparison:
 
 def tables(comparison: Comparison) -> dict[str, TextTable]:
     """Return the tables by the name of their files."""
-    short = paper_table(comparison) if comparison.has_truth else final_table(comparison, WITHOUT_TRUTH)
+    without = (
+        "size",
+        "closed_at_end",
+        "end_off",
+        "crossings",
+        "reported_degraded",
+        "reported_lost",
+        "ms_mean",
+    )
+    short = paper_table(comparison) if comparison.has_truth else final_table(comparison, without)
     return {"table": short, "metrics": final_table(comparison)}
 
 

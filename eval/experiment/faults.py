@@ -37,7 +37,6 @@ FIGURES: Final = {  # of an outcome: metric, ratio or sign of the runs, how it i
     "divergence_distance": ("divergence_distance", "max", Metric("way", "longest way over 1 m off", "m", 0)),
 }
 COUNTS: Final = ("with_map", "closed", "lost", "reported")  # which the table has as shares
-_NAME: Final = re.compile(r"(?P<kind>.+): (?P<value>[-+]?\d+(\.\d+)?)( (?P<unit>\S+))?")
 
 
 class Fault(NamedTuple):
@@ -52,7 +51,7 @@ def fault_of(noise: str) -> Fault:
     """Return the fault of a noise such as `latency: 20 ms`; SettingsError for any other name."""
     if noise == CLEAN:
         return Fault(CLEAN, 0.0, "")
-    match = _NAME.fullmatch(noise)
+    match = re.fullmatch(r"(?P<kind>.+): (?P<value>[-+]?\d+(\.\d+)?)( (?P<unit>\S+))?", noise)
     if match is None:
         raise SettingsError(f"noise: expected a name such as 'latency: 20 ms', found '{noise}'")
     return Fault(match["kind"], float(match["value"]), match["unit"] or "")

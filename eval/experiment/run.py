@@ -605,20 +605,14 @@ def run_records(
 
 
 def frame_of(study: Study, cells: Sequence[tuple[EstimatorCell, Record]]) -> pd.DataFrame:
-    """Return a row for each run and lap, or one for a failed run; every varied setting is a column.
-
-    The row of a lap has the metrics of the whole run, the last row of a record, beside its own. A run that
-    completed no lap has one row, that of the whole run as lap 1.
-    """
+    """Return a row for each run and lap, or one for a failed run; every varied setting is a column."""
     rows = list[dict[str, Any]]()
     for cell, record in cells:
         shared = {"study": study.name, **cell.names} | _settings_row(study, cell)
         about = {"failure": record["failure"], "notices": record.get("notices", ""), **record["made"]}
         about |= {"drive": cell.drive.source, "cell": cell.id}
-        *laps, whole = record["rows"] or [{}]
-        of_run = {k: v for k, v in whole.items() if k in METRICS and METRICS[k].scope == "run"}
-        laps = laps or [whole | {"lap": 1 if whole else None}]
-        rows += [shared | lap | of_run | about for lap in laps]
+        laps = measures.rows_by_lap(record["rows"]) if record["rows"] else [{"lap": None}]
+        rows += [shared | lap | about for lap in laps]
     add_batch(rows, (*RUN, "noise", "variant"))
     settings = _settings_row(study, cells[0][0])
     order = ["study", *RUN_OF, *settings, "lap", *METRICS, "failure", "notices", *versions(), "drive", "cell"]

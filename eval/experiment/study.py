@@ -339,13 +339,15 @@ def _grid(grid: Mapping[str, Sequence[Any]]) -> dict[str, Overrides]:
     if combinations > MAX_VARIANTS:
         raise SettingsError(f"grid: expected at most {MAX_VARIANTS} combinations, found {combinations}")
     points = [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
-    return {", ".join(f"{name}={_short(value)}" for name, value in point.items()): point for point in points}
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, int | float) and float(f"{value:g}") == value and not isinstance(value, bool):
-        return f"{value:g}"
-    return str(value)
+    named = dict[str, Overrides]()
+    for point in points:
+        texts = []
+        for name, value in point.items():
+            is_number = isinstance(value, int | float) and not isinstance(value, bool)
+            is_short = is_number and float(f"{value:g}") == value
+            texts.append(f"{name}={value:g}" if is_short else f"{name}={value}")
+        named[", ".join(texts)] = point
+    return named
 
 
 def shipped_studies() -> list[str]:

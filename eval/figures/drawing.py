@@ -42,30 +42,27 @@ LIGHT: Final = "#B0B0B0"
 # every kind of colour vision tells blue from orange, and so does a print without colours
 PALETTE: Final = (BLUE, ORANGE, RED, PURPLE, GREEN, DARK)
 
-_RC: Final = {
-    **dict.fromkeys(("font.size", "figure.labelsize", "axes.titlesize"), 8.0),
-    "axes.titlelocation": "left",
-    "axes.linewidth": 0.6,
-    "grid.linewidth": 0.3,
-    "grid.alpha": 0.5,
-    **{f"{axis}tick.major.width": 0.6 for axis in "xy"},
-    **{f"{axis}tick.major.size": 2.5 for axis in "xy"},
-    "legend.fontsize": 7.5,
-    "legend.frameon": False,
-    "legend.handlelength": 1.8,
-    "legend.columnspacing": 1.4,
-}
+figure_context: Final = partial(
+    mpl.rc_context,
+    {
+        **dict.fromkeys(("font.size", "figure.labelsize", "axes.titlesize"), 8.0),
+        "axes.titlelocation": "left",
+        "axes.linewidth": 0.6,
+        "grid.linewidth": 0.3,
+        "grid.alpha": 0.5,
+        **{f"{axis}tick.major.width": 0.6 for axis in "xy"},
+        **{f"{axis}tick.major.size": 2.5 for axis in "xy"},
+        "legend.fontsize": 7.5,
+        "legend.frameon": False,
+        "legend.handlelength": 1.8,
+        "legend.columnspacing": 1.4,
+    },
+)
+"""Context in which figures have the fonts and lines that they share."""
 SIGMAS: Final = 2.0  # standard deviations to the edge of a band or an ellipse
 FORMATS: Final = (".png", ".pdf", ".svg")  # suffixes under which a figure can be saved
 SUFFIXES: Final = (".png", ".pdf")  # formats of commands that write several figures: to look at, to print
 DPI: Final = 200.0  # resolution of a png (dots per inch)
-# what would differ from one run to the next is left out, and text stays text in vector formats
-_METADATA: Final = {".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
-_FILE_RC: Final = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "pathspace"}
-
-
-figure_context: Final = partial(mpl.rc_context, _RC)
-"""Context in which figures have the fonts and lines that they share."""
 
 
 class Picture(Figure):
@@ -136,23 +133,6 @@ def draw_points(
     axes.plot(*points.T, linestyle="none", marker=marker, color=color, label=label, **options)
 
 
-def draw_band(
-    axes: Axes,
-    boundary: SplineBoundary,
-    color: str,
-    label: str,
-    scale: float = 1.0,
-) -> None:
-    """Fill the 2-sigma band around a curve, `scale` times as wide as it is."""
-    left, right = uncertainty_band(boundary, curve_parameters(boundary.spline), scale)
-    outline = Outline(np.concatenate([left, right[::-1], left[:1]]), closed=True)
-    if boundary.spline.periodic:  # a ring, with edges in opposite directions
-        edges = Outline(left, closed=True), Outline(right[::-1], closed=True)
-        outline = Outline.make_compound_path(*edges)
-    look: dict[str, Any] = {"alpha": 0.35, "linewidth": 0.0, "zorder": 2}
-    axes.add_patch(PathPatch(outline, facecolor=color, label=label, **look))
-
-
 def ellipse_outlines(points: Array, joint: Array, scale: float = 1.0) -> Array:
     """Return the 2-sigma ellipse of each point (m, 2), `scale` times as large, as a closed line (m, 33, 2).
 
@@ -183,8 +163,11 @@ def check_plot_file(file: Path | str) -> str:
 def save_plot(figure: Figure, file: Path | str, dpi: float = DPI) -> None:
     """Write a .png (also to a stream), .pdf or .svg; raise SettingsError for any other suffix."""
     suffix = check_plot_file(file)
-    with atomic_file(Path(file)) as temporary, mpl.rc_context(_FILE_RC):
-        figure.savefig(temporary, dpi=dpi, format=suffix[1:], metadata=_METADATA[suffix])
+    # what would differ from one run to the next is left out, and text stays text in vector formats
+    metadata = {{".png": "Software", ".pdf": "CreationDate", ".svg": "Date"}[suffix]: None}
+    same = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "pathspace"}
+    with atomic_file(Path(file)) as temporary, mpl.rc_context(same):
+        figure.savefig(temporary, dpi=dpi, format=suffix[1:], metadata=metadata)
 
 
 def save_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
@@ -255,9 +238,9 @@ def draw_boundary(axes: Axes, boundary: MapBoundary, label: int, band_scale: flo
     """Draw a curve with its band and control points, or landmarks with their ellipses, in the map frame."""
     color, name = BOUNDARY_COLORS[label], NAMES[label]
     exaggerated = "" if band_scale == 1.0 else f" (drawn {band_scale:g}× as wide)"
+    area: dict[str, Any] = {"facecolor": color, "alpha": 0.35, "linewidth": 0.0, "zorder": 2}
     if isinstance(boundary, PointBoundary):
         ellipses = ellipse_outlines(boundary.points, boundary.covariance, band_scale)
-        area: dict[str, Any] = {"facecolor": color, "alpha": 0.35, "linewidth": 0.0, "zorder": 2}
         text = f"{name} {SIGMAS:g}σ ellipses{exaggerated}"
         axes.add_collection(PolyCollection(list(ellipses), label=text, **area))
         look_of = {"markersize": LANDMARK_SIZE, "zorder": 4}
@@ -265,7 +248,12 @@ def draw_boundary(axes: Axes, boundary: MapBoundary, label: int, band_scale: flo
         return
     spline, text = boundary.spline, f"{name} {SIGMAS:g}σ band{exaggerated}"
     if boundary.covariance.size:  # the outline of a map has none
-        draw_band(axes, boundary, color, text, band_scale)
+        left, right = uncertainty_band(boundary, curve_parameters(spline), band_scale)
+        outline = Outline(np.concatenate([left, right[::-1], left[:1]]), closed=True)
+        if spline.periodic:  # a ring, with edges in opposite directions
+            edges = Outline(left, closed=True), Outline(right[::-1], closed=True)
+            outline = Outline.make_compound_path(*edges)
+        axes.add_patch(PathPatch(outline, label=text, **area))
     until = boundary.confirmed_until
     draw_curve(axes, spline, color, f"{name} boundary", stretch=(-np.inf, until), zorder=4)
     if until < spline.domain[1]:

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from pathspace_graph.eval.metrics.measures import METRICS, health_of, measure, summarize
-from pathspace_graph.health import CONDITIONS, Health, stretches
+from pathspace_graph.eval.metrics.measures import METRICS, health_of, measure, rows_by_lap, summarize
+from pathspace_graph.health import CONDITIONS, stretches
 from pathspace_graph.io.log import Log, Odometry, Truth
 from pathspace_graph.io.map import Map
 from pathspace_graph.io.results import RunResult
@@ -85,22 +85,6 @@ def notice(event: Mapping[str, Any]) -> str:
     return "; ".join(filter(None, (event.get("notice", ""), told)))
 
 
-def health_bar(t: Sequence[float], healths: Sequence[Health]) -> str:
-    """HTML bar of the health over the time of a drive, with the reason of each stretch as its tooltip."""
-    if not len(t) or not any(one.condition for one in healths):
-        return ""
-    begin, whole = t[0], max(t[-1] - t[0], 1e-9)
-    bar = "position:relative;height:14px;max-width:700px;background:" + GREEN
-    parts = []
-    for one in stretches(t, healths):
-        left, width = 100.0 * (one.begin - begin) / whole, 100.0 * (one.end - one.begin) / whole
-        place = f"left:{left:.2f}%;width:{max(width, 0.3):.2f}%;background:{HEALTH_COLORS[one.health]}"
-        told = f"{one.begin - begin:.1f} to {one.end - begin:.1f} s: {one.health}, {one.reason}"
-        parts.append(f'<div style="position:absolute;height:14px;{place}" title="{escape(told)}"></div>')
-    share = (f"{name} {sum(one.condition == name for one in healths) / len(t):.1%}" for name in CONDITIONS)
-    return f'<div style="{bar}">{"".join(parts)}</div><p>health over time: {", ".join(share)} of cycles</p>'
-
-
 def image(picture: Any) -> str:
     """HTML image of a `Picture`."""
     data = b64encode(picture._repr_png_()).decode()
@@ -123,7 +107,19 @@ def _(record: Map | Log) -> str:
 def _(record: RunResult) -> str:
     ended = {name: getattr(record, name) for name in ("converged", "objection") if hasattr(record, name)}
     parts = (f"<h4>{title}</h4>{part}" for title, part in sections(summarize(record, None) | ended).items())
-    bar = health_bar(record.trajectory_t.tolist(), [health_of(one) for one in record.cycles])
+    bar, t, healths = "", record.trajectory_t.tolist(), [health_of(one) for one in record.cycles]
+    if any(one.condition for one in healths):  # over the time, the reason of each stretch as its tooltip
+        begin, whole, spans = t[0], max(t[-1] - t[0], 1e-9), ""
+        for one in stretches(t, healths):
+            left, width = 100.0 * (one.begin - begin) / whole, 100.0 * (one.end - one.begin) / whole
+            place = f"left:{left:.2f}%;width:{max(width, 0.3):.2f}%;background:{HEALTH_COLORS[one.health]}"
+            told = f"{one.begin - begin:.1f} to {one.end - begin:.1f} s: {one.health}, {one.reason}"
+            spans += f'<div style="position:absolute;height:14px;{place}" title="{escape(told)}"></div>'
+        shares = (
+            f"{name} {sum(one.condition == name for one in healths) / len(t):.1%}" for name in CONDITIONS
+        )
+        bar = f'<div style="position:relative;height:14px;max-width:700px;background:{GREEN}">{spans}</div>'
+        bar += f"<p>health over time: {', '.join(shares)} of cycles</p>"
     return image(record.plot()) + bar + "".join(parts)
 
 
@@ -135,14 +131,9 @@ def _(record: Checked) -> str:
 
 
 def metrics(result: RunResult, truth: Truth) -> pd.DataFrame:
-    """Metrics of `ablate` (`eval.metrics.measures`) of a run: a row for each complete lap, by its number.
-
-    Each has the metrics of the whole run as well; without a complete lap there is one row, that of the run.
-    """
+    """Metrics of `ablate` (`eval.metrics.measures`) of a run: a row for each complete lap, by its number."""
     n = len(result.trajectory_t)
     odometry = Odometry(result.trajectory_t, np.zeros((n, 3)))  # of which metrics with truth need nothing
     log = Log(odometry, (), np.zeros(3), truth=truth, scale=result.scale)
-    *laps, whole = measure(result, log)
-    of_run = {key: value for key, value in whole.items() if key in METRICS and METRICS[key].scope == "run"}
-    rows = [lap | of_run for lap in laps] or [whole | {"lap": 1}]
+    rows = rows_by_lap(measure(result, log))
     return pd.DataFrame(rows).set_index("lap").reindex(columns=[key for key in METRICS if key in rows[-1]])

@@ -123,8 +123,15 @@ def page(
         one.js_on_event(Tap, CustomJS(args={"cycles": source, "slider": slider}, code=PICK))
     if other is not None:
         name, known, apart = other
-        if set(track.splines) & set(apart.distances):
-            over.append(_distances(name, track, known, apart))
+        if shared := sorted(set(track.splines) & set(apart.distances)):
+            axes = {"title": f"distance from {name} [m]", "x_axis_label": "along the boundary [m]"}
+            beside = figure(name="over distance", tools="", **axes, **OVER)
+            for label in shared:  # of each curve of the map, along it
+                own = apart.distances[label][len(mapped_points(known.boundaries[label], STEP)) :]
+                line = {"color": drawing.BOUNDARY_COLORS[label], "legend_label": NAMES[label]}
+                beside.line(STEP * np.arange(len(own)), own, name=f"distance {NAMES[label]}", **line)
+            _legend_above(beside)
+            over.append(beside)
         rows = [(of, *(f"{x:.3f}" for x in own.values())) for of, own in apart.statistics().items()]
         told[f"Distance from {name}"] = table(rows, ("boundary [m]", "mean", "rms", "p95", "max"))
 
@@ -243,18 +250,6 @@ def _time_figures(source: ColumnDataSource, summary: Mapping[str, Any], begin: f
         found.append(drawn)
     found[-1].xaxis.update(axis_label="time [s]")
     return found
-
-
-def _distances(name: str, track: Map, known: Map, apart: MapsApart) -> figure:
-    """Distance of each curve of the map from another map, along the curve."""
-    title, along = f"distance from {name} [m]", "along the boundary [m]"
-    drawn = figure(name="over distance", title=title, x_axis_label=along, tools="", **OVER)
-    for label in sorted(set(track.splines) & set(apart.distances)):
-        own = apart.distances[label][len(mapped_points(known.boundaries[label], STEP)) :]
-        look = {"color": drawing.BOUNDARY_COLORS[label], "legend_label": NAMES[label]}
-        drawn.line(STEP * np.arange(len(own)), own, name=f"distance {NAMES[label]}", **look)
-    _legend_above(drawn)
-    return drawn
 
 
 def _legend_above(drawn: figure) -> None:

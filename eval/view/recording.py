@@ -77,26 +77,25 @@ def recording(
         stack.callback(stream.disconnect)  # before the file gets its name
         sinks = [] if path is None else [rerun.FileSink(str(path))]
         if window:
-            _open_window(rerun, stream)
+            beside = Path(sys.executable).with_name("rerun")  # need not be on the path
+            viewer = {
+                "executable_path": str(beside) if beside.exists() else None,
+                "hide_welcome_screen": True,
+            }
+            try:  # to start it, unless one is there already
+                rerun.spawn(port=PORT, connect=False, recording=stream, **viewer)
+                socket.create_connection(("127.0.0.1", PORT), 2.0).close()
+            except RuntimeError as error:
+                reason = str(error).splitlines()[0]
+                raise SettingsError(f"--view: the viewer could not be started: {reason}") from error
+            except OSError as error:
+                told = f"--view: expected the viewer on port {PORT}, found none: {error}"
+                raise SettingsError(told) from error
             sinks.append(rerun.GrpcSink(f"rerun+http://127.0.0.1:{PORT}/proxy"))
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         stream.set_sinks(*sinks, default_blueprint=blueprint(rerun))
         yield Recorder(rerun, stream, truth)
-
-
-def _open_window(rerun: Any, stream: Any) -> None:
-    """Start the viewer, unless one is there already; a SettingsError where it does not start."""
-    beside = Path(sys.executable).with_name("rerun")  # need not be on the path
-    viewer = {"executable_path": str(beside) if beside.exists() else None, "hide_welcome_screen": True}
-    try:
-        rerun.spawn(port=PORT, connect=False, recording=stream, **viewer)
-        socket.create_connection(("127.0.0.1", PORT), 2.0).close()
-    except RuntimeError as error:
-        reason = str(error).splitlines()[0]
-        raise SettingsError(f"--view: the viewer could not be started: {reason}") from error
-    except OSError as error:
-        raise SettingsError(f"--view: expected the viewer on port {PORT}, found none: {error}") from error
 
 
 # --- what is shown --------------------------------------------------------------------------------------

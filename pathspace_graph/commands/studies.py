@@ -15,6 +15,7 @@ from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.estimators import DEFAULT_ONLINE, ONLINE, check_online, make_online
 from pathspace_graph.eval import benchmark
+from pathspace_graph.eval.benchmark import RIVAL
 from pathspace_graph.eval.experiment import compare as experiment
 from pathspace_graph.eval.experiment import run as runs
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
@@ -103,7 +104,6 @@ def report_command(options: Report) -> Outcome:
 
 # --- `demo` and `compare`: estimators on a simulated track or on logs, or two maps, side by side --------
 
-RIVAL: Final = "landmark-fixed-lag"  # estimator whose table stands beside the spline graph's in the demo
 PICTURE: Final = "track.png"
 APART_FILE: Final = "apart.json"  # by which the folder is recognized
 STATISTICS: Final = ("mean", "rms", "p95", "max")

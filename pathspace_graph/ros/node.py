@@ -30,7 +30,7 @@ from pathspace_graph.io.log import SIGMA_ODOMETRY, Detections, Odometry
 from pathspace_graph.io.map import MAP_FILE, Map, SplineBoundary, map_to_json, read_map
 from pathspace_graph.labels import LEFT, RIGHT
 from pathspace_graph.online.fixed_lag import FixedLagMapper
-from pathspace_graph.run import CycleResult
+from pathspace_graph.run import CycleResult, spared_by_collector
 
 STEP: Final = 1.0  # distance of the published points of a boundary (m)
 AHEAD: Final = 20.0  # distance up to which the road ahead is published (m)
@@ -311,7 +311,8 @@ def main() -> int:
     node.create_subscription(kind, "detections", take_detections, short)
     node.create_subscription(String, "~/save", lambda one: save(Path(one.data)), 1)
     try:
-        with suppress(KeyboardInterrupt, ExternalShutdownException), threadpool_limits(limits=1):
+        stopped = suppress(KeyboardInterrupt, ExternalShutdownException)
+        with stopped, threadpool_limits(limits=1), spared_by_collector():
             rclpy.spin(node)
     finally:
         save()

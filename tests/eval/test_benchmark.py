@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +16,10 @@ import pytest
 from scipy.spatial import KDTree
 
 from pathspace_graph import cli
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import InputError, SettingsError
 from pathspace_graph.eval import benchmark
 from pathspace_graph.eval.benchmark import (
+    CAUSES,
     CONES,
     DENSE_LINE,
     GAP,
@@ -29,10 +31,14 @@ from pathspace_graph.eval.benchmark import (
     SPEED,
     ToldLandmarks,
     closed_road,
+    drives_table,
+    figures_of,
     measure_scaling,
+    measure_speed,
     open_road,
     scaling_table,
     seconds_at,
+    shares_of,
     slopes_of,
     speed_on,
     sweep_drives,
@@ -241,6 +247,7 @@ def test_figures_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
         "split_odometry": lambda _: iter([(None, None)] * 300),
         "ToldLandmarks": lambda _: SimpleNamespace(advance=lambda: 0.002),
         "FixedLagMapper": lambda *_: SimpleNamespace(lap_seconds=1.2),
+        "batch_seconds": lambda *_: 0.9,
     }.items():
         monkeypatch.setattr(benchmark, name, value)
     monkeypatch.setattr(benchmark.time, "sleep", lambda _: None)
@@ -250,8 +257,80 @@ def test_figures_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["mean_by_isam2"] == pytest.approx(later / 2.0)
     assert found["p99_by_isam2"] == pytest.approx(np.quantile(times, 0.99) / 2.0)
     assert found["mean"] == pytest.approx(times.mean())
-    single = ("closing", "swap", "slowest_other", "solve")
-    assert [found[name] for name in single] == pytest.approx([40.0, 50.0, 4.0, 1.2])
+    single = ("closing", "swap", "slowest_other", "solve", "batch")
+    assert [found[name] for name in single] == pytest.approx([40.0, 50.0, 4.0, 1.2, 0.9])
+
+
+def test_the_slowest_update_of_a_drive_has_causes_within_its_stage() -> None:
+    """A road of 50 m is open to its end: its curves grow, and no batch replaces the map."""
+    found = figures_of("road", 20, 1)
+    assert found["slowest"] >= found["p99"] > found["mean"] > 0.0 < found["batch"]
+    assert found["stage"] in {"predict", "classify", "expand", "update", "loop", "marginalize"}
+    causes = found["causes"]
+    assert {*causes} == {*CAUSES.values(), "garbage collection"}
+    assert 0.5 < sum(causes.values()) <= 1.0 and causes["growth"] > 0.0 == causes["swap of the map"]
+    assert not found["libraries"] or sum(found["libraries"].values()) == pytest.approx(1.0)
+
+
+def test_a_collection_within_an_update_is_a_cause(monkeypatch: pytest.MonkeyPatch) -> None:
+    update = benchmark.FixedLagMapper.update
+
+    def collecting(mapper: Any, *cycle: Any) -> Any:
+        result = update(mapper, *cycle)
+        if mapper.road.next_cycle == 7:
+            kept = [[] for _ in range(300_000)]
+            gc.collect()
+            del kept
+        return result
+
+    monkeypatch.setattr(benchmark.FixedLagMapper, "update", collecting)
+    assert next(iter(figures_of("road", 20, 1)["causes"])) == "garbage collection"
+
+
+@pytest.mark.slow
+def test_speed_is_measured_beside_rivals_and_of_single_drives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmark, "QUICK_DRIVES", {"a road": ("road", 20, 1)})
+    found = measure_speed(True)
+    assert len(found[""].frame) == len(SPEED)
+    assert [row["drive"] for row in found["drives"].records()] == ["a road"]
+    with pytest.raises(InputError, match="expected a log folder"):  # before anything is driven
+        measure_speed(True, [tmp_path / "none"])
+
+
+def test_a_drive_s_row_names_what_took_over_a_fifth_of_its_slowest_update() -> None:
+    causes = {"growth": 0.41, "swap of the map": 0.3, "association": 0.1}
+    row = {"mean": 4.04, "p99": 10.0, "slowest": 21.56, "stage": "expand", "causes": causes}
+    (found,) = drives_table({"a road": row | {"memory": 261.4, "batch": np.nan}}).records()
+    assert [*found.values()] == [
+        *("a road", "4.0", "10.0", "21.6", "expand"),
+        *("growth 41%, swap of the map 30%", "261", "–"),
+    ]
+
+
+def test_samples_are_summed_by_library() -> None:
+    report = """# Samples: 8
+ 50.00% ;libpython3.11.so.1.0      ;[.] _PyEval_EvalFrameDefault ;- -
+ 20.00% ;_multiarray_umath.cpython-311-x86_64-linux-gnu.so;[.] array_dealloc
+ 10.00% ;libscipy_openblas64_-32a.so;[.] dgemm_kernel
+ 6.00%  ;libc.so.6                 ;[.] _int_malloc
+ 4.00%  ;libc.so.6                 ;[.] __memmove_avx
+ 7.00%  ;_kernels.cpython-311-x86_64-linux-gnu.so;[.] kernels::summed
+ 3.00%  ;libgtsam.so.4             ;[.] Eigen::gebp
+"""
+    assert shares_of(report) == pytest.approx(
+        {
+            "Python": 0.5,
+            "kernels": 0.07,
+            "BLAS": 0.1,
+            "GTSAM": 0.03,
+            "numpy": 0.2,
+            "malloc": 0.06,
+            "rest": 0.04,
+        }
+    )
+    assert shares_of("") == {}
 
 
 def test_the_landmarks_are_the_detected_cones() -> None:

@@ -20,7 +20,7 @@ FIRST, LAST = 250, 400  # cycles of the second lap, on a closed map
 def test_a_cycle_on_a_closed_map_leaves_little_more_than_its_row_of_results(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """About 700 bytes for 17 columns, six times of stages and a pose, and some detections for the noise."""
+    """About 450 bytes for 17 columns, six times of stages and a pose, and some detections for the noise."""
     memory = dict[int, int]()
 
     def look(cycle: ObservedCycle) -> None:

@@ -54,7 +54,7 @@ def test_the_band_is_two_sigma_to_either_side_along_the_normal(scale: float) -> 
 
 def drawn_band(boundary: SplineBoundary) -> PathPatch:
     axes = Figure().subplots()
-    drawing.draw_band(axes, boundary, "black", "band")
+    drawing.draw_boundary(axes, boundary, LEFT)
     (band,) = axes.patches
     assert isinstance(band, PathPatch)
     return band
