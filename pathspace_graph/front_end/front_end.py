@@ -128,7 +128,9 @@ def judge_log(log: Log, noise: KnownNoise, settings: MapperSettings) -> JudgedLo
     settings = readings[0].measured or settings
     if readings[-1].sensor_doubted and settings.calibration.doubt < inf:
         settings = replace(settings, calibration=settings.calibration.widened())
-    chain = chained([cycle.t for cycle in log.cycles], [one.motion for one in readings], settings.odometry)
+    motions = [one.motion for one in readings]
+    steps, biases = [one.odometry for one in motions], [one.bias for one in motions]
+    chain = chained([cycle.t for cycle in log.cycles], steps, settings.odometry, biases)
     cycles, orange = [one.detections for one in readings], [one.orange for one in readings]
     return JudgedLog(chain, cycles, orange, settings, front_end.noise_used)
 

@@ -1,17 +1,17 @@
 """Odometry of a whole log, and the priors of first pose and calibrations: factors of a batch."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.odometry import accumulated
+from pathspace_graph.factors.odometry import IntegratedOdometry, accumulated
 from pathspace_graph.factors.se2 import compose
 from pathspace_graph.graph.elimination import owners
 from pathspace_graph.graph.rows import OdometryChain, Rows, odometry_rows
 from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, Variables, pose_key
-from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
+from pathspace_graph.mapping.motion import BiasMeasurement
 from pathspace_graph.settings.mapper import CalibrationSettings, OdometrySettings
 
 
@@ -71,10 +71,12 @@ def _prior(key: int, root: Array, off: Array) -> Rows:
 
 
 def chained(
-    stamps: Sequence[float], motions: Sequence[MeasuredMotion], settings: OdometrySettings
+    stamps: Sequence[float],
+    steps: Sequence[IntegratedOdometry],
+    settings: OdometrySettings,
+    biases: Iterable[BiasMeasurement | None] = (),
 ) -> LogOdometry:
-    """Chain the motions of cycles with these stamps (s); each motion ends at the pose of its cycle."""
-    steps = [motion.odometry for motion in motions]
+    """Chain the odometry of cycles with these stamps (s): each step ends at the pose of its cycle."""
     return LogOdometry(
         stamps=np.array(stamps),
         first=compose(np.zeros(3), steps[0].delta),
@@ -83,7 +85,7 @@ def chained(
         twists=np.array([step.twist for step in steps]),
         calibration_mean=np.array(settings.means),
         calibration_sigma=np.array(settings.sigmas),
-        bias=mean_bias([motion.bias for motion in motions if motion.bias is not None]),
+        bias=mean_bias([bias for bias in biases if bias is not None]),
     )
 
 

@@ -12,10 +12,11 @@ import numpy as np
 from pathspace_graph.copies import Copyable
 from pathspace_graph.factors.arrays import Array, BoolArray
 from pathspace_graph.factors.noise import ASSUMED_DRIFT, KnownNoise, MeasuredNoise, TwistNoise
+from pathspace_graph.factors.odometry import IntegratedOdometry
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io.log import Detections, Odometry
 from pathspace_graph.io.results import NoiseSource, RunNoise
-from pathspace_graph.mapping.motion import MeasuredMotion
+from pathspace_graph.mapping.motion import MeasuredMotion, integrated_again
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .line_noise import measured_by_lines
@@ -125,14 +126,14 @@ class NoiseLearner(Copyable):
             covariances = measured.inflated(points, detections.covariances)
         return Detections(detections.t, measured.unbent(points), covariances, detections.labels)
 
-    def motions_of_lap(self, motions: Sequence[MeasuredMotion]) -> Sequence[MeasuredMotion]:
-        """Return the motions of a drive with the noise known now.
+    def odometry_of_lap(self, motions: Sequence[MeasuredMotion]) -> list[IntegratedOdometry]:
+        """Return the odometry of a drive with the noise known now.
 
         The first seconds, before any measurement, determine the heading of the map.
         """
         if self.of_odometry and self.measured is not None:
-            return [motion.with_noise(self.twist) for motion in motions]
-        return motions
+            return integrated_again(motions, self.twist)
+        return [motion.odometry for motion in motions]
 
     def calibrated(self, settings: MapperSettings) -> MapperSettings:
         """Return settings with measured priors of the sensor's errors, if the old ones cannot be relied on.

@@ -173,8 +173,9 @@ class DriveRecord(Copyable):
     ) -> OpenLap:
         """Return the drive for a batch, with the priors of the calibrations in `settings`."""
         cycles = [*self._measured]
-        motions = noise.motions_of_lap([one.motion for one in cycles])
-        chain = chained([*self.stamps], motions, settings.odometry)
+        motions = [one.motion for one in cycles]
+        steps, biases = noise.odometry_of_lap(motions), [one.bias for one in motions]
+        chain = chained([*self.stamps], steps, settings.odometry, biases)
         table = DetectionTable.of([one.seen for one in cycles], twists=chain.twists)
         factors = tuple(one for one in self.factors if one.cycle < first_kept)
         return OpenLap(settings, chain, _for_map(table, noise), first_kept, start, revisits, factors)

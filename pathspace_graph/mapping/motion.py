@@ -1,5 +1,6 @@
 """The motion between two perception cycles, prediction (paper: Predict), and calibration."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
 from typing import Final, Self
@@ -44,19 +45,13 @@ class MeasuredMotion:
     excess: Array = field(default_factory=lambda: np.zeros(3))
     """(3,) or (k, 3) Additional standard deviation of a twist that is extrapolated for long."""
 
-    def with_noise(self, noise: TwistNoise) -> Self:
-        """Integrate the motion again with other noise of a twist."""
-        if self.durations is None:
-            return self
-        sigmas = np.hypot(noise.sigmas(self.durations), self.excess)
-        return replace(self, odometry=integrate_twists(self.durations, self.twists, sigmas))
-
     def with_missed(self, sigmas: Array, noise: TwistNoise) -> Self:
         """Add the standard deviations (3,) of a motion that the twists have missed (m, m, rad)."""
         if self.durations is None or not self.durations.any():
             return self
         excess = np.hypot(self.excess, sigmas / float(np.linalg.norm(self.durations)))
-        return replace(self, excess=excess).with_noise(noise)
+        motion = replace(self, excess=excess)
+        return replace(motion, odometry=integrated_again([motion], noise)[0])
 
     @property
     def rests(self) -> bool:
@@ -68,6 +63,20 @@ class MeasuredMotion:
         if self.missing:
             return "there is no odometry"
         return "the detections contradict the odometry" if self.doubted else ""
+
+
+def integrated_again(motions: Sequence[MeasuredMotion], noise: TwistNoise) -> list[IntegratedOdometry]:
+    """Return the odometry of motions, integrated with other noise of a twist where it is of twists."""
+    durations = [motion.durations for motion in motions if motion.durations is not None]
+    sigmas, steps, end = noise.sigmas(np.concatenate([np.zeros(0), *durations])), [], 0
+    for motion in motions:
+        step = motion.odometry
+        if motion.durations is not None:
+            begin, end = end, end + len(motion.durations)
+            own = np.hypot(sigmas[begin:end], motion.excess)
+            step = integrate_twists(motion.durations, motion.twists, own)
+        steps.append(step)
+    return steps
 
 
 def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:

@@ -8,7 +8,7 @@ import pytest
 from pathspace_graph.front_end.log_odometry import chained, half_square, sensor_prior
 from pathspace_graph.graph.variables import SENSOR_KEY, Variables, pose_keys
 from pathspace_graph.io.log import Odometry
-from pathspace_graph.mapping.motion import MeasuredMotion, integrate_odometry
+from pathspace_graph.mapping.motion import integrate_odometry
 from pathspace_graph.settings.mapper import CalibrationSettings, OdometrySettings
 
 KNOWN, ESTIMATED = CalibrationSettings(sensor=False), CalibrationSettings()
@@ -27,7 +27,7 @@ def test_the_prior_counts_from_its_mean_in_its_sigmas() -> None:
 @pytest.mark.parametrize(("settings", "keys"), [(KNOWN, 1), (ESTIMATED, 2)])
 def test_a_sensor_that_is_known_has_no_prior(settings: CalibrationSettings, keys: int) -> None:
     still = integrate_odometry(Odometry(np.zeros(1), np.zeros((1, 3))), 0.1, np.ones(3))
-    chain = chained([0.1], [MeasuredMotion(still, np.zeros((1, 3)))], OdometrySettings())
+    chain = chained([0.1], [still], OdometrySettings())
     variables = Variables()
     variables.insert_calibrations(np.zeros(2 + 5 * settings.sensor))
     variables.insert(pose_keys(np.arange(1)), np.zeros(3))
@@ -41,6 +41,6 @@ def test_the_first_pose_is_as_uncertain_as_the_start_and_the_odometry_since() ->
     odometry = Odometry(np.zeros(1), np.zeros((1, 3)))
     step = integrate_odometry(odometry, 2.0, np.array([3.0, 1.0, 0.5]))
     settings = OdometrySettings()
-    chain = chained([2.0], [MeasuredMotion(step, odometry.twist)], settings)
+    chain = chained([2.0], [step], settings)
     variances = np.square(settings.sigmas_start) + np.array([36.0, 4.0, 1.0])
     np.testing.assert_allclose(np.linalg.inv(chain.first_information), np.diag(variances), rtol=1e-6)

@@ -14,7 +14,7 @@ from pathspace_graph.factors.noise import TwistNoise
 from pathspace_graph.factors.se2 import relative
 from pathspace_graph.front_end.motion import MATCHING, Matching, MotionCheck
 from pathspace_graph.io.log import Detections, Log, Odometry
-from pathspace_graph.mapping.motion import MeasuredMotion
+from pathspace_graph.mapping.motion import MeasuredMotion, integrated_again
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MotionSettings
 from pathspace_graph.sim.sensor import OdometryNoise
@@ -163,7 +163,9 @@ def test_what_twists_lack_is_how_much_longer_they_are_held_than_usual() -> None:
     np.testing.assert_allclose(motion.excess, longer[:, None] * MotionSettings.accelerations)
     assert (motion.excess[:, 0] > 0.0).tolist() == [False, False, True, False]
     assert not (motion.missing or motion.stuck)
-    np.testing.assert_array_equal(motion.with_noise(noise).odometry.covariance, motion.odometry.covariance)
+    empty = MeasuredMotion(motion.odometry, motion.twists)  # of detections, not of twists
+    for again in integrated_again([motion, empty, motion], noise):
+        np.testing.assert_array_equal(again.covariance, motion.odometry.covariance)
     np.testing.assert_array_equal(held(3, 1.2).excess, 0.0)
     assert held(4, 2.3).missing
 

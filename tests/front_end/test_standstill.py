@@ -17,7 +17,7 @@ from pathspace_graph.front_end.motion import MATCHING, MotionCheck
 from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.labels import LEFT
-from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion
+from pathspace_graph.mapping.motion import BiasMeasurement, MeasuredMotion, integrated_again
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings, MotionSettings
@@ -363,8 +363,8 @@ def test_the_motion_in_which_a_rest_ends_may_have_missed_the_start(log: Log) -> 
     assert len(starts) == 1, "one rest ends"
     assert log.cycles[int(starts[0])].t == pytest.approx(REST, abs=0.5)
     np.testing.assert_allclose(sigmas[starts[0]], np.hypot([0.3, 0.05, 0.0], sigmas[starts[0] + 1]), rtol=0.1)
-    again = motions[int(starts[0])].with_noise(TwistNoise(2.0 * log.odometry_sigma))
-    assert again.odometry.covariance[0, 0] > 0.3**2, "measured noise does not forget it"
+    again = integrated_again(motions, TwistNoise(2.0 * log.odometry_sigma))[int(starts[0])]
+    assert again.covariance[0, 0] > 0.3**2, "measured noise does not forget it"
 
 
 def test_a_vehicle_that_creeps_is_not_at_rest() -> None:
