@@ -196,7 +196,8 @@ class Closed(Phase):
         if not self.map_repair.is_due(self.known_loop, road.smoother, t, driven):
             return ""
         if drive.record.unsolvable is None:
-            drive.begin_batch(road, reading, self.map_repair.begin(road.smoother, drive.record.poses), ())
+            start = self.map_repair.begin(road.smoother, drive.record.poses)
+            drive.begin_batch(road, reading.noise, start, ())
             return ""
         self.known_loop = KnownLoop()
         return self.map_repair.in_place(road.smoother)

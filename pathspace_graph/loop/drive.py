@@ -242,15 +242,13 @@ class Drive(Copyable):
     # --- batches -----------------------------------------------------------------------------------------
 
     def begin_batch(
-        self, road: Road, reading: Reading, start: StartMap | None, revisits: tuple[Revisit, ...]
+        self, road: Road, noise: NoiseLearner, start: StartMap | None, revisits: tuple[Revisit, ...]
     ) -> None:
         """Start a batch of the drive with its revisits, from a map or from odometry."""
         self.record.linearize(road)
         window = road.smoother.first_cycle, road.next_cycle - 1
-        lap = partial(
-            self.record.lap, start=start, revisits=revisits, settings=self.priors, noise=reading.noise
-        )
-        self.solver.begin(lap, window, reading.detections.t)
+        lap = partial(self.record.lap, start=start, revisits=revisits, settings=self.priors, noise=noise)
+        self.solver.begin(lap, window, road.smoother.times[-1])
 
     def outcome(self, road: Road, spent: float) -> Outcome | None:
         """Return the result of the batch if it is due in this cycle, which has taken `spent` (s)."""
@@ -312,6 +310,9 @@ class Phase(Copyable):
         """Act after the update of a cycle, which has taken `spent` (s); do nothing while the drive rests."""
         drive.record.estimated(road)
         return Step(self)
+
+    def begin(self, road: Road, drive: Drive, noise: NoiseLearner) -> None:
+        """Start the batch for which the last cycle has found a reason, if it has."""
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
         """Continue from the result of a batch."""

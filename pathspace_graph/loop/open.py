@@ -56,6 +56,7 @@ class Open(Phase):
         self.returns = ReturnFinder(settings)
         self.revisits = Revisits(settings)
         self.asked_by: Revisit | None = None  # relative pose that started the newest batch
+        self._found: Revisit | None = None  # one that was found in the last cycle: each takes long enough
         self._closes = False  # whether that batch is to close the loop
         self._taken_back = 0  # how often curves had been taken back before
         self._said = False  # whether a notice has said why there is no batch
@@ -80,26 +81,37 @@ class Open(Phase):
             if cones > MOST_CONES:
                 drive.record.give_up("the lap has too many cones for a batch")
             if drive.record.unsolvable is not None:
+                self._found = None
                 said, self._said = self._said, True  # only the first notice says why
                 return Step(self, notice="" if said else f"{STAYS_OPEN}: {drive.record.unsolvable}")
-            revisit, record, noise = None, drive.record, reading.noise
-            if road.path.length > self.settings.closing.min_path:
-                revisit = self.returns.find(road, record, noise)
-            self._closes = revisit is not None
-            if self._closes:
-                self.returns.rest(road, RETRY)
-            else:
-                revisit = self.revisits.find(road, record, noise)
-            if revisit is None:
-                return Step(self)
-            if not self._closes and sum(one.size for one in road.boundaries.values()) > MOST_LAID_ON:
-                said, self._said = self._said, True
-                return Step(self, notice="" if said else f"{NOT_REVISITED}: {TOO_LONG}")
-            self.asked_by, self._taken_back = revisit, road.growth.taken_back
-            start = None if self._closes else open_map(road, record.with_window(road))
-            drive.begin_batch(road, reading, start, (revisit, *drive.revisits))
+            if self._found is None:
+                return self._search(road, drive, reading.noise)
+            self.begin(road, drive, reading.noise)
         outcome = drive.outcome(road, spent)
         return Step(self) if outcome is None else self.take(road, drive, outcome)
+
+    def _search(self, road: Road, drive: Drive, noise: NoiseLearner) -> Step:
+        """Look for a return to the beginning, or else for other road that is driven again."""
+        revisit, record = None, drive.record
+        if road.path.length > self.settings.closing.min_path:
+            revisit = self.returns.find(road, record, noise)
+        self._closes = revisit is not None
+        if self._closes:
+            self.returns.rest(road, RETRY)
+        else:
+            revisit = self.revisits.find(road, record, noise)
+            if revisit and sum(one.size for one in road.boundaries.values()) > MOST_LAID_ON:
+                said, self._said = self._said, True
+                return Step(self, notice="" if said else f"{NOT_REVISITED}: {TOO_LONG}")
+        self._found = revisit
+        return Step(self)
+
+    def begin(self, road: Road, drive: Drive, noise: NoiseLearner) -> None:
+        """Start the batch of the return or the revisit that the last cycle has found, if it has."""
+        if self._found is not None:
+            self.asked_by, self._found, self._taken_back = self._found, None, road.growth.taken_back
+            start = None if self._closes else open_map(road, drive.record.with_window(road))
+            drive.begin_batch(road, noise, start, (self.asked_by, *drive.revisits))
 
     # --- results -----------------------------------------------------------------------------------------
 
@@ -284,6 +296,10 @@ class Seeking(Phase):
         jump = drive.take_known(road, self.known, place.pose, widened(place))
         phase = Closed(road, self.known.crosses) if self.known.closed else OnOpenMap()
         return Step(phase, jump, "; ".join(filter(None, [step.notice, PLACED])), Health(DEGRADED, PLACED))
+
+    def begin(self, road: Road, drive: Drive, noise: NoiseLearner) -> None:
+        """Start a batch of the own road."""
+        self.own.begin(road, drive, noise)
 
     def take(self, road: Road, drive: Drive, outcome: Outcome) -> Step:
         """Continue from a batch of the own road."""

@@ -474,6 +474,7 @@ class FixedLagMapper(MapperEstimate):
 
         A return in the last metres of a drive closes the loop only here.
         """
+        self.phase.begin(self.road, self.drive, self.front_end.noise)
         outcome = self.drive.solver.last_outcome(self.road.next_cycle - 1)
         if outcome is not None:
             self.phase = self.phase.take(self.road, self.drive, outcome).phase

@@ -27,7 +27,7 @@ from pathspace_graph.labels import LEFT
 from pathspace_graph.loop import lap_solver
 from pathspace_graph.loop.known_loop import REPAIRED
 from pathspace_graph.loop.lap_solver import LONGEST_WAIT
-from pathspace_graph.loop.open import RETRY, STAYS_OPEN, ReturnFinder, Revisits
+from pathspace_graph.loop.open import RETRY, STAYS_OPEN, Open, ReturnFinder, Revisits
 from pathspace_graph.online.fixed_lag import FixedLagMapper
 from pathspace_graph.run import CycleResult, run_online, split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
@@ -360,11 +360,23 @@ def test_a_return_begins_the_batch_with_a_pose_beside_an_early_one(sent: list[Sl
         if sent:
             break
     (revisit,) = sent[0].lap.revisits
-    assert sent[0].lap.start is None and revisit.later == mapper.road.smoother.next_cycle - 1
+    assert sent[0].lap.start is None and revisit.later == mapper.road.smoother.next_cycle - 2
     assert np.hypot(*revisit.local[:2]) < 3.0 and path_lengths(truth)[revisit.earlier] < 60.0
     off = revisit.local - relative(truth[revisit.earlier], truth[revisit.later])
     assert np.hypot(*off[:2]) < 0.8
     assert abs(wrap_angle(off[2:])[0]) < 0.05
+
+
+def test_a_return_in_the_last_cycle_of_a_drive_closes_the_loop(stem: Stem) -> None:
+    mapper = stem.mapper()
+    for cycle in stem.rest(log()):
+        mapper.update(*cycle)
+        assert isinstance(mapper.phase, Open)
+        if mapper.phase._found is not None:
+            break
+    assert not mapper.drive.solver.is_busy
+    mapper.finish()
+    assert mapper.closed
 
 
 # --- a batch that does not agree -------------------------------------------------------------------------
