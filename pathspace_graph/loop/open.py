@@ -166,8 +166,7 @@ class ReturnFinder(Copyable):
         """Return the newest pose relative to an early one, if it is recognized there."""
         length, cycle, closing = road.path.length, road.next_cycle, self._settings.closing
         tried, tried_cycle = self._tried
-        interval = closing.check_interval * (2.0 if road.busy else 1.0)
-        waited = length >= tried + interval or cycle >= tried_cycle + RETURN_CYCLES
+        waited = length >= tried + closing.check_interval or cycle >= tried_cycle + RETURN_CYCLES
         if length < self._rests_until or not waited:
             return None
         self._tried = length, cycle
@@ -207,7 +206,7 @@ class Revisits(Copyable):
         The newest pose will stay in the window, and the batch's marginal has no measurement of such a pose.
         """
         length = road.path.length
-        if length < self._next + REVISIT_ATTEMPTS * road.busy or self.settings.of_lines:
+        if length < self._next or self.settings.of_lines:
             return None
         self._next = length + REVISIT_ATTEMPTS
         poses = record.with_window(road)

@@ -53,9 +53,6 @@ class Road:
         """Detections of orange cones, which are points of the map."""
         self.grown: frozenset[int] = frozenset()
         """Curves that grew in the newest cycle; the next one tests the whole window for them."""
-        self.busy = (
-            False  # whether curves grew or a stretch became inactive: either takes as long as an update
-        )
         self._attach()
 
     def copy(self) -> Self:
@@ -103,7 +100,7 @@ class Road:
             self.grown, notice = self.growth.expand(self.smoother, path_ahead)
             if self.grown:
                 self.smoother.map.lay_out_stations()  # control points are on other rows
-        self.busy = self.smoother.deactivate_distant(spare=not self.grown) or bool(self.grown)
+        self.smoother.deactivate_distant(spare=not self.grown)
         return notice
 
     def update(self) -> None:

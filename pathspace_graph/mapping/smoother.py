@@ -166,14 +166,13 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
 
     # --- the active part ---------------------------------------------------------------------------------
 
-    def deactivate_distant(self, spare: bool = True) -> bool:
+    def deactivate_distant(self, spare: bool = True) -> None:
         """Restrict steps to the control points that the window can reach, and some room for the next cycles.
 
         The active part of a closed map is chosen again when it does not contain what the window needs. The
         inactive part of an open map grows with the drive, where possible in a cycle with time to `spare`.
         Inactive control points keep their linearization point. From a map that is solved as a whole, a closed
-        one differs by millimetres to centimetres, an open one by decimetres. Return whether some became
-        inactive.
+        one differs by millimetres to centimetres, an open one by decimetres.
         """
         state = self.map.state
         needed = {label: self._needed(label) for label in state.boundaries}
@@ -184,16 +183,15 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
             keys = [state.control_keys(label)[indices] for label, indices in needed.items()]
             self.activate(np.concatenate(keys))
         elif not self._is_worthwhile(needed, FAR_STRETCH if spare else 2.0 * FAR_STRETCH):
-            return False
+            return
         active = {label: self._needed(label, FAR_ROOM) for label in state.boundaries}
         leaving = [np.setdiff1d(state.active(label), indices) for label, indices in active.items()]
         if not any(map(len, leaving)):
-            return False
+            return
         keys = [state.control_keys(label)[indices] for label, indices in zip(active, leaving, strict=True)]
         self.deactivate(np.concatenate(keys))
         state.activate_only(active)
         self.transform_to_origin()
-        return True
 
     def _is_worthwhile(self, needed: dict[int, IntArray], stretch: float) -> bool:
         """Whether a closed curve is active all around, or an open one for a stretch (m) behind."""

@@ -28,7 +28,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return ways
 
 
-def searched(finder: ReturnFinder, cycle: int, length: float, busy: bool = False) -> None:
+def searched(finder: ReturnFinder, cycle: int, length: float) -> None:
     """Search on a road with a curve whose first 30 m count."""
     line = BSpline.open_uniform(np.column_stack([np.arange(9.0), np.zeros(9)]))
     smoother = SimpleNamespace(
@@ -47,7 +47,6 @@ def searched(finder: ReturnFinder, cycle: int, length: float, busy: bool = False
         "poses": [None],
         "boundaries": boundaries,
         "smoother": smoother,
-        "busy": busy,
     }
     finder.find(SimpleNamespace(**road, settings=None), record, None)  # type: ignore[arg-type]
 
@@ -69,10 +68,6 @@ def test_an_attempt_waits_for_some_metres_and_for_some_cycles_at_rest(tried: lis
     assert len(tried) == 2
     searched(finder, RETURN_CYCLES + 1, 100.0 + STEP)
     assert len(tried) == 3
-    searched(finder, RETURN_CYCLES + 2, 100.0 + 2.99 * STEP, busy=True)
-    assert len(tried) == 3
-    searched(finder, RETURN_CYCLES + 2, 100.0 + 3.0 * STEP, busy=True)
-    assert len(tried) == 4
 
 
 def test_nothing_is_tried_in_a_rest(tried: list[str]) -> None:

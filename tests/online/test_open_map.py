@@ -59,5 +59,5 @@ def test_a_cycle_without_time_to_spare_waits_for_twice_the_stretch(monkeypatch: 
     for stretch, spare, leaves in ((11.0, True, False), (18.0, False, False), (18.0, True, True)):
         kept = {label: state.active(label)[round(stretch / spacing) :] for label in first}
         monkeypatch.setattr(smoother, "_needed", lambda label, room=0.0, kept=kept: kept[label])
-        assert smoother.deactivate_distant(spare) == leaves
+        smoother.deactivate_distant(spare)
         assert all(state.active(label)[0] > first[label] for label in first) == leaves
