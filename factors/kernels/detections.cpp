@@ -155,9 +155,7 @@ T taken(const T& from, const std::vector<Index>& rows) {
 struct Seen {
   Seen(const std::vector<Index>& rows, const Ints& cycles, const Array& measured, const Array& twists,
        const Array& poses, Index first_cycle, const Array& sensor)
-      : cycle(taken(cycles, rows)),
-        measured(taken(measured, rows)),
-        twist(taken(twists, rows)) {
+      : cycle(taken(cycles, rows)), measured(taken(measured, rows)), twist(taken(twists, rows)) {
     std::vector<Index> slots(cycle.data(), cycle.data() + cycle.size());
     for (Index& slot : slots) slot -= first_cycle;
     pose = taken(poses, slots);
@@ -237,10 +235,9 @@ py::tuple curve_rows(const Curves& curves, const py::tuple& on_curves, const py:
   const auto parts = [&](const py::tuple& terms, const Ints& own, const Ints& columns, const bool* counts) {
     return weighted(terms, own, columns, counts, control_keys, huber, first_pose, sensor_key);
   };
-  const py::tuple across =
-      detection_rows(seen.points, taken(covariances, chosen), seen.pose, foot[3].cast<Array>(),
-                     foot[4].cast<Array>(), foot[6].cast<Array>(), seen.measured, seen.twist, sensor,
-                     limits[2].cast<double>());
+  const py::tuple across = detection_rows(seen.points, taken(covariances, chosen), seen.pose,
+                                          foot[3].cast<Array>(), foot[4].cast<Array>(), foot[6].cast<Array>(),
+                                          seen.measured, seen.twist, sensor, limits[2].cast<double>());
   py::list groups;
   groups.append(parts(across, seen.cycle, foot[8].cast<Ints>(), interior.data()));
   if (!stations.is_none()) {
@@ -252,10 +249,10 @@ py::tuple curve_rows(const Curves& curves, const py::tuple& on_curves, const py:
     const Ints own = taken(columns, at);
     controls.assign(own.data(), own.data() + own.size());
     const Seen there(rows, cycle, table[4].cast<Array>(), table[5].cast<Array>(), poses, first_cycle, sensor);
-    const py::tuple along = station_rows(
-        there.points, taken(covariances, rows), there.pose, taken(laid[0].cast<Array>(), at),
-        taken(laid[1].cast<Array>(), at), taken(control_points, controls), there.measured,
-        there.twist, sensor, taken(laid[3].cast<Array>(), at));
+    const py::tuple along =
+        station_rows(there.points, taken(covariances, rows), there.pose, taken(laid[0].cast<Array>(), at),
+                     taken(laid[1].cast<Array>(), at), taken(control_points, controls), there.measured,
+                     there.twist, sensor, taken(laid[3].cast<Array>(), at));
     groups.append(parts(along, there.cycle, own, nullptr));
   }
   return py::make_tuple(Ints(Shape{m}, chosen.data()), found, reached, groups);
