@@ -17,7 +17,7 @@ from pathspace_graph.batch.association import (
     nearest_by,
 )
 from pathspace_graph.batch.simplification import reknot
-from pathspace_graph.errors import SettingsError
+from pathspace_graph.errors import SettingsError, SingularSystemError
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
@@ -31,6 +31,7 @@ from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph
 from pathspace_graph.graph.rows import Revisit, Rows, at_values, by_widths, odometry_factor, revisit_rows
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
+    POINT,
     POSE,
     Layout,
     are_poses,
@@ -268,6 +269,15 @@ class BatchSystem:
         """Linear problem with its poses eliminated."""
         return Elimination(self.linear_graph(at), at.state.variables.layout)
 
+    def damping(self, state: State) -> list[Rows]:
+        """Rows that damp the motion of control points relative to the poses beside them."""
+        groups = list[Rows]()
+        for label, one in self.weak.items():
+            root = np.tile(np.eye(POINT) / SIGMA_DAMPED, (len(one.keys), 1, 1))
+            rows = replace(one, whitener=root).places(state.variables)
+            groups.append(replace(rows, residual=np.zeros(len(rows)), owner=owners(rows.owner, label)))
+        return groups
+
     def retract(self, state: State, step: Array) -> State:
         """Return the state after a step (n,) in relative coordinates.
 
@@ -373,6 +383,7 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
 
 GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
 CHANGED_SHARE: Final = 1e-3  # largest share of detections that change in the last round of associations
+SIGMA_DAMPED: Final = 10.0  # of a step of a control point beside its pose, where the system is singular (m)
 TOLERANCE_DECREASE: Final = 0.05  # largest predicted decrease of the cost in the last step; one sigma is 1/2
 ROUGH_TOLERANCE: Final = 100.0  # factor of the tolerance while knots or stations still change
 CREEP_SHARES: Final = (0.3, 0.97)  # ratio of a step to the last one between which it is extrapolated
@@ -488,7 +499,10 @@ class Optimizer:
         system, state, layout, cost = self.system, at.state, at.state.variables.layout, at.cost
         system.detections.refine(at.across.rows, at.u)  # later evaluations refine these foot points
         rows = system.rows(at)
-        step = solution(linear_graph(rows, state.variables), layout)
+        try:
+            step = solution(linear_graph(rows, state.variables), layout)
+        except SingularSystemError:  # on kilometres, round-off may leave a control point free
+            step = solution(linear_graph([*rows, *system.damping(state)], state.variables), layout)
         decrease, before, self._last_step = predicted_decrease(rows, layout, step), self._last_step, None
         for share in 0.5 ** np.arange(8):
             self.steps += 1
