@@ -269,11 +269,11 @@ class BatchSystem:
         """Linear problem with its poses eliminated."""
         return Elimination(self.linear_graph(at), at.state.variables.layout)
 
-    def damping(self, state: State) -> list[Rows]:
-        """Rows that damp the motion of control points relative to the poses beside them."""
+    def damping(self, state: State, sigma: float) -> list[Rows]:
+        """Rows that damp the motion of control points relative to the poses beside them, to sigma (m)."""
         groups = list[Rows]()
         for label, one in self.weak.items():
-            root = np.tile(np.eye(POINT) / SIGMA_DAMPED, (len(one.keys), 1, 1))
+            root = np.tile(np.eye(POINT) / sigma, (len(one.keys), 1, 1))
             rows = replace(one, whitener=root).places(state.variables)
             groups.append(replace(rows, residual=np.zeros(len(rows)), owner=owners(rows.owner, label)))
         return groups
@@ -383,7 +383,7 @@ def drive_factors(system: BatchSystem, at: Evaluation) -> Iterator[gtsam.Nonline
 
 GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down to `batch.gate`
 CHANGED_SHARE: Final = 1e-3  # largest share of detections that change in the last round of associations
-SIGMA_DAMPED: Final = 10.0  # of a step of a control point beside its pose, where the system is singular (m)
+SIGMAS_DAMPED: Final = (10.0, 1.0, 0.1)  # of a step of a control point beside its pose, while singular (m)
 TOLERANCE_DECREASE: Final = 0.05  # largest predicted decrease of the cost in the last step; one sigma is 1/2
 ROUGH_TOLERANCE: Final = 100.0  # factor of the tolerance while knots or stations still change
 CREEP_SHARES: Final = (0.3, 0.97)  # ratio of a step to the last one between which it is extrapolated
@@ -499,10 +499,15 @@ class Optimizer:
         system, state, layout, cost = self.system, at.state, at.state.variables.layout, at.cost
         system.detections.refine(at.across.rows, at.u)  # later evaluations refine these foot points
         rows = system.rows(at)
-        try:
-            step = solution(linear_graph(rows, state.variables), layout)
-        except SingularSystemError:  # on kilometres, round-off may leave a control point free
-            step = solution(linear_graph([*rows, *system.damping(state)], state.variables), layout)
+        damped = rows
+        for sigma in SIGMAS_DAMPED:
+            try:
+                step = solution(linear_graph(damped, state.variables), layout)
+                break
+            except SingularSystemError:  # on kilometres, round-off may leave a control point free
+                damped = [*rows, *system.damping(state, sigma)]
+        else:
+            step = solution(linear_graph(damped, state.variables), layout)
         decrease, before, self._last_step = predicted_decrease(rows, layout, step), self._last_step, None
         for share in 0.5 ** np.arange(8):
             self.steps += 1

@@ -153,14 +153,14 @@ def test_where_the_system_is_singular_a_damped_step_leads_to_the_same_optimum(
 
     def singular(graph: Any, layout: Any) -> NDArray[np.float64]:
         factors.append(len(set(graph.keyVector())))
-        if len(factors) % 2:
+        if len(factors) % 3:  # until the second damping
             raise SingularSystemError("free")
         return solution(graph, layout)
 
     system, state = noisy()
     monkeypatch.setattr("pathspace_graph.batch.system.solution", singular)
     found, convergence = Optimizer(system).run(state, Stage(BATCH.gate, 40, 1e-4))
-    assert convergence.converged and len(factors) >= 2 * convergence.rounds
+    assert convergence.converged and len(factors) >= 3 * convergence.rounds
     off = found.state.variables.values - expected.state.variables.values
     np.testing.assert_allclose(off, 0.0, atol=2e-3)
 
