@@ -494,21 +494,22 @@ class Optimizer:
         """Take a Gauss-Newton step, halved until the cost does not grow; return the decrease it predicts.
 
         The problem stays as it is if no part of the step decreases the cost. On a long road, a whole step
-        turns the map by more than its linearization holds for.
+        turns the map by more than its linearization holds for, and round-off may leave a control point free:
+        then the step is damped, and the decrease infinite, since it may be short without convergence.
         """
         system, state, layout, cost = self.system, at.state, at.state.variables.layout, at.cost
         system.detections.refine(at.across.rows, at.u)  # later evaluations refine these foot points
         rows = system.rows(at)
-        damped = rows
-        for sigma in SIGMAS_DAMPED:
+        for sigma in (np.inf, *SIGMAS_DAMPED):
+            damped = system.damping(state, sigma) if sigma < np.inf else []
             try:
-                step = solution(linear_graph(damped, state.variables), layout)
+                step = solution(linear_graph([*rows, *damped], state.variables), layout)
                 break
-            except SingularSystemError:  # on kilometres, round-off may leave a control point free
-                damped = [*rows, *system.damping(state, sigma)]
-        else:
-            step = solution(linear_graph(damped, state.variables), layout)
-        decrease, before, self._last_step = predicted_decrease(rows, layout, step), self._last_step, None
+            except SingularSystemError:
+                if sigma == SIGMAS_DAMPED[-1]:
+                    raise
+        decrease = np.inf if damped else predicted_decrease(rows, layout, step)
+        before, self._last_step = self._last_step, None
         for share in 0.5 ** np.arange(8):
             self.steps += 1
             trial = system.evaluate(system.retract(state, share * step))

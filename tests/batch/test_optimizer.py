@@ -143,26 +143,28 @@ def test_without_rounds_left_it_has_not_converged() -> None:
     assert convergence.reason == "no round left"
 
 
-def test_where_the_system_is_singular_a_damped_step_leads_to_the_same_optimum(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize("always", [False, True])
+def test_where_the_system_is_singular_damped_steps_lead_to_the_same_optimum(
+    always: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Round-off may leave a control point free on kilometres: here it does so in every step."""
+    """Round-off may leave a control point free on kilometres: here in the first steps, or in every one."""
     system, state = noisy()
     expected, _ = Optimizer(system).run(state, Stage(BATCH.gate, 40, 1e-4))
-    factors = list[int]()
+    calls = list[int]()
 
     def singular(graph: Any, layout: Any) -> NDArray[np.float64]:
-        factors.append(len(set(graph.keyVector())))
-        if len(factors) % 3:  # until the second damping
+        calls.append(graph.size())
+        if len(calls) % 3 and (always or len(calls) < 6):  # until the second damping
             raise SingularSystemError("free")
         return solution(graph, layout)
 
     system, state = noisy()
     monkeypatch.setattr("pathspace_graph.batch.system.solution", singular)
     found, convergence = Optimizer(system).run(state, Stage(BATCH.gate, 40, 1e-4))
-    assert convergence.converged and len(factors) >= 3 * convergence.rounds
     off = found.state.variables.values - expected.state.variables.values
     np.testing.assert_allclose(off, 0.0, atol=2e-3)
+    assert convergence.converged != always  # a damped step is short without convergence
+    assert len(calls) >= (3 * convergence.rounds if always else convergence.rounds + 4)
 
 
 def test_the_cost_never_grows_in_a_step() -> None:
