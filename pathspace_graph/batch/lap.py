@@ -29,7 +29,7 @@ from pathspace_graph.graph.variables import POINT, POSE
 from pathspace_graph.labels import BOUNDARIES
 from pathspace_graph.mapping.detection_rows import Stations
 from pathspace_graph.mapping.detections import DetectionTable
-from pathspace_graph.mapping.smoother import FAR_ROOM
+from pathspace_graph.mapping.smoother import FAR_ROOM, reached
 from pathspace_graph.mapping.state import SAMPLE, GivenFactor, State
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.spline.boundary import (
@@ -79,8 +79,7 @@ class LapMarginal:
     poses: Array  # (P, 3) poses of all cycles, map frame
     first_kept: int  # cycle that ends the marginal: it has all measurements of earlier poses, and no others
     mean: Array  # (n,) mean of the marginal
-    root: Array  # (n, n) upper triangular square root R of its information `R' R`, columns in this order:
-    order: IntArray  # (n,) its variables, those that the window will not reach first
+    root: Array  # (n, n) upper triangular square root R of its information `R' R`, by `far_first`
     near: dict[int, IntArray]
     """(k,) control points of closed curves that the window may reach, in driving order; all if missing."""
     scatter: dict[int, Array]
@@ -93,12 +92,6 @@ class LapMarginal:
     @property
     def closed(self) -> bool:
         return any(spline.periodic for spline in self.splines.values())
-
-    @property
-    def information(self) -> Array:
-        """Information (n, n) of the marginal, the inverse of its covariance."""
-        by_entry = self.root[:, np.argsort(self.order)]
-        return np.asarray(by_entry.T @ by_entry)
 
 
 def solve_lap(lap: OpenLap) -> LapMarginal:
@@ -120,7 +113,8 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             objection = disagreement(system, at.state.poses, calibration, earlier)
         information, mean, dense = marginal_of(system, at, few, change, lap.first_kept)
         near = reached_next(few, lap) if few.closed else {}
-        order = far_first(few, near, len(at.state.variables.calibrations), len(mean))
+        sizes = {label: boundary.size for label, boundary in few.boundaries.items()}
+        order = far_first(sizes, near, len(at.state.variables.calibrations))
         if system.stations is not None:
             cones = stations_on(few, system.stations, at.state, change, dense)
         elif at.state.closed:
@@ -137,7 +131,6 @@ def solve_lap(lap: OpenLap) -> LapMarginal:
             first_kept=lap.first_kept,
             mean=mean,
             root=upper_root(information[np.ix_(order, order)]),
-            order=order,
             near=near,
             scatter=scatter,
             cones=cones,
@@ -192,23 +185,25 @@ def reached_next(few: State, lap: OpenLap) -> dict[int, IntArray]:
 
     The vehicle drives on while the batch runs, for a share of the drive so far.
     """
-    gate, slide = lap.settings.gate, lap.settings.spline.refine_room
-    meanwhile, near = AHEAD_SHARE * path_lengths(few.poses)[-1], dict[int, IntArray]()
-    for label, boundary in few.boundaries.items():
-        u = few.pose_u[label][lap.first_kept :]
-        ahead = gate.view_ahead + gate.station_ahead + FAR_ROOM + meanwhile
-        near[label] = boundary.stretch(u.min() - gate.view_behind - slide, u.max() + ahead + slide)
-    return near
+    room = FAR_ROOM + AHEAD_SHARE * path_lengths(few.poses)[-1]
+    return {
+        label: reached(boundary, few.pose_u[label][lap.first_kept :], lap.settings, room)
+        for label, boundary in few.boundaries.items()
+    }
 
 
-def far_first(few: State, near: Mapping[int, IntArray], before: int, count: int) -> IntArray:
-    """Order the `count` entries of [calibration (before,) | control points | pose], far points first."""
-    is_far = np.zeros((len(few.map_points), POINT), bool)
-    for label, points in near.items():
-        first = map_block(few, label).start // POINT
-        is_far[first + np.delete(few.boundaries[label].everything, points)] = True
-    far = before + np.flatnonzero(is_far)
-    return np.concatenate([far, np.setdiff1d(np.arange(count), far)])
+def far_first(sizes: Mapping[int, int], near: Mapping[int, IntArray], before: int) -> IntArray:
+    """Order the entries of [calibration (before,) | control points by label | pose], far points first.
+
+    `sizes` are the numbers of control points, of which those that are not `near` are far.
+    """
+    is_far = [np.zeros(before, bool)]
+    for label, size in sorted(sizes.items()):
+        points = np.full(size, label in near)
+        points[near.get(label, [])] = False
+        is_far.append(np.repeat(points, POINT))
+    goes_first = np.concatenate([*is_far, np.zeros(POSE, bool)])
+    return np.argsort(~goes_first, kind="stable")
 
 
 def stations_on(

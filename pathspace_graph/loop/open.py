@@ -56,7 +56,7 @@ class Open(Phase):
         self.returns = ReturnFinder(settings)
         self.revisits = Revisits(settings)
         self.asked_by: Revisit | None = None  # relative pose that started the newest batch
-        self._found: Revisit | None = None  # one that was found in the last cycle: each takes long enough
+        self._found: Revisit | None = None  # found in the last cycle; its batch starts in this one
         self._closes = False  # whether that batch is to close the loop
         self._taken_back = 0  # how often curves had been taken back before
         self._said = False  # whether a notice has said why there is no batch

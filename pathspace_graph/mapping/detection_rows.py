@@ -182,9 +182,8 @@ class Stations:
         """
         poses = state.variables.poses_at(detections.cycle[rows])
         sigma = sigma_across(directions, detections.covariance[rows], poses, SIGMA_POSE)
-        colour = np.where(
-            detections.boundary[rows] == detections.label[rows], detections.label[rows], UNKNOWN
-        )
+        label = detections.label[rows]
+        colour = np.where(detections.boundary[rows] == label, label, UNKNOWN)
         for curve in self.curves:
             own = colour == curve.label
             detections.match(rows[own], curve.matched(detections.u[rows[own]], sigma[own]))

@@ -13,7 +13,7 @@ from pathspace_graph.graph.smoother import FixedLagSmoother
 from pathspace_graph.graph.variables import pose_keys
 from pathspace_graph.labels import UNKNOWN
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.spline.boundary import relocate
+from pathspace_graph.spline.boundary import Boundary, relocate
 
 from .curve_map import CurveMap
 from .detection_rows import rows_across
@@ -210,18 +210,22 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         made.
         """
         boundary, pose_u = self.map.state.boundaries[label], self.map.state.pose_u[label]
-        gate, slide = self.map.settings.gate, self.map.settings.spline.refine_room
-        low = float(pose_u.min()) - gate.view_behind
-        if not boundary.periodic:
-            low = float(self.map.detections.u[self.map.detections.used_on(label)].min(initial=low))
-        low -= slide
+        settings, weak = self.map.settings, self.map.weak.get(label)
         if boundary.periodic:
-            ahead = gate.view_ahead + gate.station_ahead + slide + room
-            return boundary.stretch(low, float(pose_u.max()) + ahead)
-        first, weak = boundary.tables.span_of(low), self.map.weak.get(label)
+            return reached(boundary, pose_u, settings, room)
+        low = float(pose_u.min()) - settings.gate.view_behind
+        low = float(self.map.detections.u[self.map.detections.used_on(label)].min(initial=low))
+        first = boundary.tables.span_of(low - settings.spline.refine_room)
         if weak is not None and len(weak.keys):  # an end that was carried on may lie farther behind
             first = min(first, int(weak.triples.min() - self.map.state.control_keys(label)[0]))
         return np.arange(first, boundary.size)
+
+
+def reached(boundary: Boundary, pose_u: Array, settings: MapperSettings, room: float) -> IntArray:
+    """Control points (k,) of a closed curve that poses at parameters (P,) can reach, and `room` (m) ahead."""
+    gate, slide = settings.gate, settings.spline.refine_room
+    ahead = gate.view_ahead + gate.station_ahead + slide + room
+    return boundary.stretch(float(pose_u.min()) - gate.view_behind - slide, float(pose_u.max()) + ahead)
 
 
 def _holds(active: IntArray, needed: IntArray, size: int) -> bool:

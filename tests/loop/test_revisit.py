@@ -34,6 +34,7 @@ from pathspace_graph.sim.simulate import SimulationSettings, simulate
 from pathspace_graph.sim.track import skidpad
 
 from ..scenes import drives
+from ..scenes.batch import information_of
 from ..scenes.drives import beginning, map_log, path_of, true_poses
 
 STEP = 1.0
@@ -219,12 +220,12 @@ def test_the_prior_is_the_marginal_with_the_present_priors_of_the_calibrations()
         smoother, marginal = one.after.smoother, one.marginal
         layout = Layout(np.sort(keys_of(smoother.prior)))
         information, vector = normal_equations(smoother.prior, layout)
-        own, expected = slice(0, len(marginal.calibration)), marginal.information.copy()
+        own, expected = slice(0, len(marginal.calibration)), information_of(marginal).copy()
         (mean, sigma), (mean_then, sigma_then) = smoother.calibration_prior, marginal.calibration_prior
         expected[own, own] += np.diag(sigma**-2.0 - sigma_then**-2.0)
         scale = np.sqrt(np.diagonal(expected))
         assert np.abs((information - expected) / np.outer(scale, scale)).max() < 1e-9
-        right = marginal.information @ marginal.mean
+        right = information_of(marginal) @ marginal.mean
         right[own] += mean / sigma**2 - mean_then / sigma_then**2
         reference = smoother.variables.reference[smoother.variables.layout.entries(layout.keys)]
         off = reference + np.linalg.solve(information, vector) - np.linalg.solve(expected, right)
@@ -292,7 +293,7 @@ def test_a_revisit_that_is_off_by_a_gap_of_cones_is_refused(gaps: int) -> None:
 def test_a_marginal_leaves_the_slide_of_an_open_end_to_the_window() -> None:
     """Hardly anything is known of it: growth places the last control points again."""
     for one in replaced():
-        covariance, at = np.linalg.inv(one.marginal.information), len(one.marginal.calibration)
+        covariance, at = np.linalg.inv(information_of(one.marginal)), len(one.marginal.calibration)
         for spline in one.marginal.splines.values():
             at += 2 * spline.size
             along = spline.tangent_unit(np.array(spline.domain[1:]))[0]

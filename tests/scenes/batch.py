@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pathspace_graph.batch.association import add_drive, associate, locate_poses
+from pathspace_graph.batch.lap import LapMarginal, far_first
 from pathspace_graph.batch.simplification import boundary_of, own_settings
 from pathspace_graph.batch.start import start_odometry
 from pathspace_graph.batch.system import BatchSystem, moved
@@ -147,3 +148,11 @@ def detections_of(points_vehicle: Array, labels: IntArray, sigma: float) -> Dete
     covariances, table = np.tile(sigma**2 * np.eye(2), (len(labels), 1, 1)), DetectionTable()
     table.append(Detections(0.0, points_vehicle, covariances, labels), 0)
     return table
+
+
+def information_of(marginal: LapMarginal) -> NDArray[np.float64]:
+    """Returns the information (n, n) of a marginal on [calibration | control points | pose]."""
+    sizes = {label: spline.size for label, spline in marginal.splines.items()}
+    order = far_first(sizes, marginal.near, len(marginal.calibration))
+    by_entry = marginal.root[:, np.argsort(order)]
+    return np.asarray(by_entry.T @ by_entry)
