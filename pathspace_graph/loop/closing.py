@@ -103,7 +103,6 @@ def take_marginal(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor
     and go on to grow; their ends that have grown since move with the vehicle.
     """
     smoother, state, settings = road.smoother, road.smoother.map.state, road.settings
-    smoother.transform_to_origin()
     window = road.poses[marginal.first_kept - smoother.first_cycle :]
     solved = marginal.poses[marginal.first_kept :]
     motion = compose(solved[-1], inverse(window[len(solved) - 1]))
@@ -140,7 +139,6 @@ def take_known(road: Road, known: KnownMap, pose: Array, covariance: Array) -> A
 
     The covariance (3, 3) is of the newest pose, map frame.
     """
-    road.smoother.transform_to_origin()
     settings, state, boundaries = road.settings, road.smoother.map.state, road.boundaries
     points = [spline.distinct_control_points for _, spline in sorted(known.splines.items())]
     sigmas = np.array(SIGMAS_CALIBRATIONS)[: len(state.variables.calibrations)]

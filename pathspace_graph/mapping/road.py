@@ -5,6 +5,7 @@ A cycle follows the paper: predict, classify, expand, update, and finally margin
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import ClassVar, Final, Self
 
 import gtsam
@@ -20,7 +21,7 @@ from pathspace_graph.spline.boundary import Boundary
 from .growth import GROWTH_REACH, Growth
 from .motion import MeasuredMotion, predict
 from .path import DrivenPath
-from .smoother import CurveSmoother, Gating
+from .smoother import FAR_STRETCH, CurveSmoother, Gating
 from .tracks import OrangeDetections, orange_cones
 
 HELD: Final = "the user's factors fix the frame of the open map: it is no longer relinearized as a whole"
@@ -92,15 +93,20 @@ class Road:
             self.growth.observe(track, new, detections.t)
         return Classified(new, tested)
 
-    def expand(self) -> str:
-        """Grow open curves, and deactivate the part of the map behind; return a notice."""
+    def expand(self, *, replaced: bool = False) -> str:
+        """Grow open curves, and deactivate the part of the map behind; return a notice.
+
+        Where the map is going to be `replaced` in this cycle, nothing of it is deactivated. A cycle that has
+        grown leaves a stretch to the next ones, if they can wait.
+        """
         self.grown, notice = frozenset(), ""
         if not self.closed:
             path_ahead = self.path.ahead(self.poses[-1], GROWTH_REACH)
             self.grown, notice = self.growth.expand(self.smoother, path_ahead)
             if self.grown:
                 self.smoother.map.lay_out_stations()  # control points are on other rows
-        self.smoother.deactivate_distant(spare=not self.grown)
+        waiting = inf if replaced else 2.0 * FAR_STRETCH if self.grown else FAR_STRETCH
+        self.smoother.deactivate_distant(waiting)
         return notice
 
     def update(self) -> None:

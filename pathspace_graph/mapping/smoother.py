@@ -166,11 +166,11 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
 
     # --- the active part ---------------------------------------------------------------------------------
 
-    def deactivate_distant(self, spare: bool = True) -> None:
+    def deactivate_distant(self, stretch: float = FAR_STRETCH) -> None:
         """Restrict steps to the control points that the window can reach, and some room for the next cycles.
 
         The active part of a closed map is chosen again when it does not contain what the window needs. The
-        inactive part of an open map grows with the drive, where possible in a cycle with time to `spare`.
+        inactive part of an open map grows with the drive, once a `stretch` (m) of it can become inactive.
         Inactive control points keep their linearization point. From a map that is solved as a whole, a closed
         one differs by millimetres to centimetres, an open one by decimetres.
         """
@@ -182,7 +182,7 @@ class CurveSmoother(FixedLagSmoother[CurveMap]):
         ):
             keys = [state.control_keys(label)[indices] for label, indices in needed.items()]
             self.activate(np.concatenate(keys))
-        elif not self._is_worthwhile(needed, FAR_STRETCH if spare else 2.0 * FAR_STRETCH):
+        elif not self._is_worthwhile(needed, stretch):
             return
         active = {label: self._needed(label, FAR_ROOM) for label in state.boundaries}
         leaving = [np.setdiff1d(state.active(label), indices) for label, indices in active.items()]

@@ -415,7 +415,8 @@ class FixedLagMapper(MapperEstimate):
         classified = road.classify(reading.detections, twist, use=use)
         phase, health = self.phase.judge(road, drive, classified, reading)
         watch.lap("classify")
-        grown = road.expand()  # through detections that no curve explains
+        replaced = drive.solver.is_due(road.next_cycle - 1)
+        grown = road.expand(replaced=replaced)  # through detections that no curve explains
         watch.lap("expand")
         road.update()
         watch.lap("update")

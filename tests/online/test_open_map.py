@@ -10,6 +10,7 @@ import pytest
 from pathspace_graph.graph.variables import CALIBRATION_KEY
 from pathspace_graph.io.log import Odometry
 from pathspace_graph.labels import LEFT
+from pathspace_graph.mapping.smoother import FAR_STRETCH
 from pathspace_graph.settings.mapper import MapperSettings
 
 from ..scenes.drives import ahead, corridor, exact_log, map_log
@@ -51,13 +52,22 @@ def test_control_points_that_a_detection_holds_stay_active() -> None:
     assert state.boundaries[LEFT].tables.span_of(behind - 2.0) == state.active(LEFT)[0]
 
 
-def test_a_cycle_without_time_to_spare_waits_for_twice_the_stretch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_becomes_inactive_of_a_map_that_is_replaced_in_this_cycle() -> None:
+    mapper, _ = map_log(exact_log(ahead(10.0, 12.0), *corridor(150.0)))
+    asked = list[float]()
+    mapper.road.smoother.deactivate_distant = asked.append  # type: ignore[method-assign,assignment]
+    mapper.road.expand(replaced=True)
+    mapper.road.expand()
+    assert asked[0] == np.inf and asked[1] in (FAR_STRETCH, 2.0 * FAR_STRETCH)
+
+
+def test_a_stretch_of_its_length_becomes_inactive(monkeypatch: pytest.MonkeyPatch) -> None:
     mapper, _ = map_log(exact_log(ahead(10.0, 12.0), *corridor(150.0)))
     smoother = mapper.road.smoother
     state, spacing = smoother.map.state, smoother.map.settings.spline.spacing
     first = {label: state.active(label)[0] for label in state.boundaries}
-    for stretch, spare, leaves in ((11.0, True, False), (18.0, False, False), (18.0, True, True)):
-        kept = {label: state.active(label)[round(stretch / spacing) :] for label in first}
+    for behind, stretch, leaves in ((11.0, 12.0, False), (18.0, 24.0, False), (18.0, 12.0, True)):
+        kept = {label: state.active(label)[round(behind / spacing) :] for label in first}
         monkeypatch.setattr(smoother, "_needed", lambda label, room=0.0, kept=kept: kept[label])
-        smoother.deactivate_distant(spare)
+        smoother.deactivate_distant(stretch)
         assert all(state.active(label)[0] > first[label] for label in first) == leaves
