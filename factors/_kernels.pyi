@@ -185,8 +185,10 @@ def station_rows(
     The rest is as in `detection_rows`.
     """
 
-def integrated(durations: Array, twists: Array, sigmas: Array) -> tuple[Array, Array, Array]:
-    """Return end pose (3,), covariance (3, 3) and calibration derivative (3, 2) of `integrate_twists`."""
+def integrated(
+    durations: Array, twists: Array, sigmas: Array, ends: IntArray, least: float
+) -> list[tuple[Array, Array, Array, Array]]:
+    """Return the fields of `IntegratedOdometry` but the last of each of the motions of `integrate_each`."""
 
 def whitener(covariance: Array, least: float) -> Array:
     """Return lower triangular W (3, 3) with `W' W` the inverse of a covariance (3, 3) plus `least^2`."""

@@ -51,12 +51,19 @@ def integrate_twists(durations: Array, twists: Array, sigma: Array) -> Integrate
     and `w + bias`, so the calibrated end pose is the end pose minus `calibration_jacobian @ (scale, bias)`.
     Without samples the result is the identity with zero covariance.
     """
-    if len(durations) == 0:
-        return integrated_odometry(np.zeros(3), np.zeros((3, 3)), np.zeros((3, CALIBRATION_SIZE)))
     sigmas = np.empty(twists.shape)
     sigmas[:] = sigma  # ten times faster than `broadcast_to`
-    motion = kernels.integrated(durations, twists, sigmas)
-    return IntegratedOdometry(*motion, kernels.whitener(motion[1], MIN_SIGMA), twists[-1])
+    return integrate_each(durations, twists, sigmas, [len(durations)])[0]
+
+
+def integrate_each(
+    durations: Array, twists: Array, sigmas: Array, counts: list[int]
+) -> list[IntegratedOdometry]:
+    """Integrate the twists of motions, `counts` of each; the arrays are as in `integrate_twists`, stacked."""
+    ends = np.cumsum(counts, dtype=np.intp)
+    motions = kernels.integrated(durations, twists, sigmas, ends, MIN_SIGMA)
+    last = [twists[end - 1] if count else np.zeros(3) for end, count in zip(ends, counts, strict=True)]
+    return [IntegratedOdometry(*motion, twist) for motion, twist in zip(motions, last, strict=True)]
 
 
 def integrated_odometry(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:

@@ -364,7 +364,7 @@ class MotionCheck {
         array_of({3, 3}, whitener_of(own.covariance.data(), kMinSigma)), array_of({3}, found.twist));
     const Array of_motion = found.source == Source::kOdometry ? twists : array_of({1, 3}, found.twist);
     const py::object durations = held ? py::object(Array(held, found.durations.data())) : py::none();
-    const Array excess = held ? Array(Shape{held, 3}, found.excess.data()) : array_of({3}, Pose{});
+    const Array excess(Shape{held, 3}, found.excess.data());
     return py::make_tuple(odometry, of_motion, found.doubted, found.missing, found.stuck, bias, durations,
                           excess, leaves);
   }

@@ -101,12 +101,20 @@ Matrix3 whitener_of(const double* K, double least) {
 
 namespace {
 
-py::tuple integrated(const Array& durations, const Array& twists, const Array& sigmas) {
-  const Index count = durations.shape(0);
-  expect(count > 0 && twists.size() == 3 * count && sigmas.size() == 3 * count);
-  const Integrated of = integrate(count, durations.data(), twists.data(), sigmas.data());
-  return py::make_tuple(array_of({3}, of.end), array_of({3, 3}, of.covariance),
-                        array_of({3, 2}, of.by_calibration));
+py::list integrated(const Array& durations, const Array& twists, const Array& sigmas, const Ints& ends,
+                    double least) {
+  const Index n = durations.shape(0), m = ends.shape(0);
+  expect(twists.size() == 3 * n && sigmas.size() == 3 * n);
+  py::list out;
+  for (Index i = 0, begin = 0; i < m; begin = ends.data()[i++]) {
+    expect(begin <= ends.data()[i] && ends.data()[i] <= n);
+    const Integrated of = integrate(ends.data()[i] - begin, durations.data() + begin,
+                                    twists.data() + 3 * begin, sigmas.data() + 3 * begin);
+    out.append(py::make_tuple(array_of({3}, of.end), array_of({3, 3}, of.covariance),
+                              array_of({3, 2}, of.by_calibration),
+                              array_of({3, 3}, whitener_of(of.covariance.data(), least))));
+  }
+  return out;
 }
 
 Array whitener(const Array& covariance, double least) {

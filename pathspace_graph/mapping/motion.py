@@ -10,9 +10,14 @@ import numpy as np
 from pathspace_graph.errors import SettingsError
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.noise import KnownNoise, TwistNoise
-from pathspace_graph.factors.odometry import CALIBRATION_SIZE, IntegratedOdometry, integrate_twists
+from pathspace_graph.factors.odometry import (
+    CALIBRATION_SIZE,
+    IntegratedOdometry,
+    integrate_each,
+    integrate_twists,
+)
 from pathspace_graph.graph.smoother import FixedLagSmoother
-from pathspace_graph.graph.variables import CALIBRATION_KEY, SENSOR_KEY, pose_key
+from pathspace_graph.graph.variables import CALIBRATION_KEY, POSE, SENSOR_KEY, pose_key
 from pathspace_graph.graph.window import MapRows, SmootherSettings
 from pathspace_graph.io.log import SIGMA_ODOMETRY, Odometry
 from pathspace_graph.io.results import VehicleState
@@ -42,8 +47,8 @@ class MeasuredMotion:
     stuck: bool = False  # whether the twist repeats to the last digit
     bias: BiasMeasurement | None = None  # bias, if just measured at rest
     durations: Array | None = None  # (k,) durations of the twists (s); None if they are not the odometry's
-    excess: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,) or (k, 3) Additional standard deviation of a twist that is extrapolated for long."""
+    excess: Array = field(default_factory=lambda: np.zeros((0, POSE)))
+    """(k, 3) Additional standard deviation of a twist that is extrapolated for long, with `durations`."""
 
     def with_missed(self, sigmas: Array, noise: TwistNoise) -> Self:
         """Add the standard deviations (3,) of a motion that the twists have missed (m, m, rad)."""
@@ -68,15 +73,13 @@ class MeasuredMotion:
 def integrated_again(motions: Sequence[MeasuredMotion], noise: TwistNoise) -> list[IntegratedOdometry]:
     """Return the odometry of motions, integrated with other noise of a twist where it is of twists."""
     durations = [motion.durations for motion in motions if motion.durations is not None]
-    sigmas, steps, end = noise.sigmas(np.concatenate([np.zeros(0), *durations])), [], 0
-    for motion in motions:
-        step = motion.odometry
-        if motion.durations is not None:
-            begin, end = end, end + len(motion.durations)
-            own = np.hypot(sigmas[begin:end], motion.excess)
-            step = integrate_twists(motion.durations, motion.twists, own)
-        steps.append(step)
-    return steps
+    of_twists = [motion for motion in motions if motion.durations is not None]
+    if not of_twists:
+        return [motion.odometry for motion in motions]
+    held, twists = np.concatenate(durations), np.concatenate([motion.twists for motion in of_twists])
+    sigmas = np.hypot(noise.sigmas(held), np.concatenate([motion.excess for motion in of_twists]))
+    again = iter(integrate_each(held, twists, sigmas, [len(one) for one in durations]))
+    return [motion.odometry if motion.durations is None else next(again) for motion in motions]
 
 
 def known_noise(sigma: Array | KnownNoise | None) -> KnownNoise:
