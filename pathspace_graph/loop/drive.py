@@ -28,7 +28,7 @@ from pathspace_graph.mapping.detections import DetectionColumns, DetectionTable
 from pathspace_graph.mapping.motion import MeasuredMotion, inflate_priors
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.mapping.state import GivenFactor
-from pathspace_graph.places.find import SeenIn
+from pathspace_graph.places.find import LOOKUP_RANGE, SeenIn
 from pathspace_graph.settings.mapper import MapperSettings
 
 from .closing import take_known, take_marginal
@@ -148,7 +148,7 @@ class DriveRecord(Copyable):
         self.poses = self.corrected = read_only(unwrap(poses))
 
     def seen_in(self, sensor: Array, noise: NoiseLearner) -> SeenIn:
-        """Return a lookup of the detections of given cycles, of orange cones too.
+        """Return a lookup of the detections of given cycles within `LOOKUP_RANGE`, of orange cones too.
 
         Points are corrected by the calibration of the sensor, (5,) or (0,).
         """
@@ -157,6 +157,7 @@ class DriveRecord(Copyable):
             chosen = [self._measured[k] for k in cycles.tolist()]
             twists = np.array([one.motion.odometry.twist for one in chosen]).reshape(-1, POSE)
             table = DetectionColumns.of([one.seen.with_others(one.orange) for one in chosen], twists=twists)
+            table = table.where(np.hypot(*table.measured.T) < LOOKUP_RANGE)
             table = replace(_for_map(table, noise), cycle=cycles[table.cycle])
             table.correct(sensor)
             return table

@@ -5,7 +5,7 @@ cones or curves verify them. Cones stand at regular distances, so a few of them 
 has log odds against every rival: the other places, and that the vehicle is at none of them.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf, log
 from typing import Any, Final, Self
@@ -38,6 +38,7 @@ FAILED: Final = 20.0  # largest cost of the distance from a prior: twice the log
 FIT_LIMITS: Final = (FIT_SIGMA, FIT_GATE, VOTE_CELL, VOTE_TURN, PLACES_APART, float(PLACES), MATCHING, FAILED)
 REACH: Final = (6.0, 0.2)  # largest distance and angle of a place from a pose on a path (m, rad)
 MERGE_RANGE: Final = 16.0  # largest range of merged detections (m)
+LOOKUP_RANGE: Final = 1.25 * MERGE_RANGE  # largest measured range of detections that may be merged (m)
 PATH_STEP: Final = 2.0  # distance of neighbouring poses from which cones are seen, or a place is tried (m)
 LINE_WEIGHT: Final = 0.25
 """Weight of a point of a line, merged to about 1 m: neighbours on a line say the same for 4 m."""
@@ -377,6 +378,7 @@ NEWEST_PATHS: Final = NEWEST_PATH, 2.0 * NEWEST_PATH  # lengths that are tried (
 BEYOND: Final = 10.0  # length by which the earlier path exceeds the newest on each side (m)
 NEARBY: Final = (1.0, 1.0, 0.05), (4.0, 0.15)
 """Sigmas (m, m, rad) and reach (m, rad) after laps were aligned, or beside another pass of an open road."""
+STANDING: Final = 0.1  # path of one cycle of the earlier pass: a standing sensor repeats its errors (m)
 STRETCH: Final = 60.0  # length of a path that shows its place by its shape, or crosses the start (m)
 CLOSES_WITHIN: Final = 200.0  # length of the drive's beginning on which a lap of cones may close (m)
 
@@ -395,13 +397,14 @@ def return_to_beginning(
     covariance: Array,
     settings: MapperSettings,
     curves: SampledCurves | None = None,
+    lengths: Sequence[float] | None = None,
 ) -> Revisit | None:
     """Return the newest pose in the frame of one at the beginning of the drive, if its place is sure.
 
     `poses` (P, 3) are those of all cycles, and `covariance` (3, 3) is that of the newest. It is tried at the
-    poses of the beginning that the covariance allows. Lines are laid on the beginning of `curves`. The newest
-    path must cross the start line: in each round of a skidpad the vehicle is on its beginning again, but has
-    not closed a lap.
+    poses of the beginning that the covariance allows. Lines are laid on the beginning of `curves`; `lengths`
+    are those of `newest_place`. The newest path must cross the start line: in each round of a skidpad the
+    vehicle is on its beginning again, but has not closed a lap.
     """
     stations, least = se2.path_lengths(poses), settings.closing.min_path
     length = float(stations[-1])
@@ -414,7 +417,7 @@ def return_to_beginning(
     if len(tried) == 0:
         return None
     if curves is None:
-        place = newest_place(seen_in, poses, tried, prior, settings)
+        place = newest_place(seen_in, poses, tried, prior, settings, lengths)
     else:
         place = sure(find(seen_lately(seen_in, poses, NEWEST_PATH, settings), curves, prior))
     earlier = None if place is None else beside(place, poses, beginning)
@@ -466,24 +469,32 @@ def newest_place(
     near: IntArray,
     prior: Prior,
     settings: MapperSettings,
+    lengths: Sequence[float] | None = None,
 ) -> Place | None:
     """Return the sure place of the newest cones on those around earlier cycles (k,).
 
-    Where rows of cones are too regular, a longer stretch of the newest path is laid, up to a tenth of the
-    drive: the longer that is, the more places does its drift allow.
+    The newest path has one of some `lengths` (m), by default of all `newest_paths`.
     """
     stations = se2.path_lengths(poses)
     around = stations[near.min()], stations[near.max()]
-    for length in NEWEST_PATHS:
-        if length > max(0.1 * stations[-1], NEWEST_PATH):
-            break
+    for length in lengths or newest_paths(float(stations[-1])):
         seen = seen_lately(seen_in, poses, length, settings)
         least, most = around[0] - length - BEYOND, around[1] + length + BEYOND
         old = np.flatnonzero((stations > least) & (stations < min(most, stations[-1] - length)))
+        old = old[np.unique(stations[old] // STANDING, return_index=True)[1]]
         place = sure(find(seen, Constellation.of(seen_in(old), poses, settings.growth), prior))
         if place is not None:
             return place
     return None
+
+
+def newest_paths(driven: float) -> tuple[float, ...]:
+    """Return the lengths (m) of the newest path whose cones are laid on earlier ones, after a drive (m).
+
+    Where rows of cones are too regular, a longer stretch is laid, up to a tenth of the drive: the longer that
+    is, the more places does its drift allow.
+    """
+    return tuple(length for length in NEWEST_PATHS if length <= max(0.1 * driven, NEWEST_PATH))
 
 
 def seen_lately(seen_in: SeenIn, poses: Array, length: float, settings: MapperSettings) -> Constellation:

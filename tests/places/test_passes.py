@@ -347,6 +347,21 @@ def test_a_round_of_a_skidpad_is_no_lap() -> None:
     assert return_to_beginning(seen_in, poses, UNCERTAIN, SETTINGS) is None
 
 
+def test_a_vehicle_that_stood_has_seen_the_earlier_cones_once() -> None:
+    """A standing sensor repeats its errors; of its cycles the first one counts."""
+    true = along(LAP, (20.0, 1.0 / 12.0))
+    stood, poses = (np.concatenate([np.repeat(way[:1], 50, axis=0), way]) for way in (true, drifted(true)))
+    seen_in, asked = sensor(stood), list[IntArray]()
+
+    def recorded(cycles: IntArray) -> DetectionColumns:
+        asked.append(cycles)
+        return seen_in(cycles)
+
+    assert return_to_beginning(recorded, poses, UNCERTAIN, SETTINGS) is not None
+    _, earlier = asked
+    assert (earlier <= 50).sum() == 1 and len(earlier) > 10
+
+
 KILOMETRE = (1000.0, 2.0 * np.pi / 1000.0)
 FAR = np.array([60.0, -80.0, 0.25])  # drift of the second half of a kilometre
 
