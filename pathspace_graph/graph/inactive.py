@@ -243,6 +243,8 @@ class InactiveChain(InactiveMap):
         super().__init__()
         self.links: list[Link] = []
         self._pose_keys: IntArray = NO_KEYS  # (a,) keys of the origin and of past anchors, ascending
+        self._by_link = NO_KEYS, NO_KEYS, NO_KEYS
+        """Keys of the links' frames, and of their variables y and z, link after link."""
         self.poses: dict[int, Array] = {}  # (3,) of the origin and of past anchors by key, as of `refresh`
 
     def copy(self) -> Self:
@@ -295,11 +297,12 @@ class InactiveChain(InactiveMap):
         return graph
 
     def _changed(self) -> None:
-        leaving = [link.leaving.keys for link in self.links]
-        keys = np.concatenate([NO_KEYS, *leaving])
-        self.keys, self._pose_keys = np.sort(keys[~are_poses(keys)]), np.sort(keys[are_poses(keys)])
-        self.anchors = np.array([link.factor.frame for link in self.links[-1:]], np.intp)
-        self._active = None
+        frames = np.array([link.factor.frame for link in self.links], np.intp)
+        leaving = np.concatenate([NO_KEYS, *(link.leaving.keys for link in self.links)])
+        others = np.concatenate([NO_KEYS, *(link.others.keys for link in self.links)])
+        self._by_link, is_pose = (frames, leaving, others), are_poses(leaving)
+        self.keys, self._pose_keys = np.sort(leaving[~is_pose]), np.sort(leaving[is_pose])
+        self.anchors, self._active = frames[-1:], None
 
     def refresh(self, variables: Variables) -> None:
         if not self.links:
@@ -312,11 +315,8 @@ class InactiveChain(InactiveMap):
 
     def _columns(self, layout: Layout) -> tuple[IntArray, IntArray, IntArray]:
         """Return the columns of the links' frames (l,), and of their variables y and z, link after link."""
-        frames, leaving, others = zip(
-            *((link.factor.frame, link.leaving.keys, link.others.keys) for link in self.links), strict=True
-        )
-        by_link = layout.entries(np.concatenate(leaving)), layout.entries(np.concatenate(others))
-        return (layout.columns(np.array(frames)), *by_link)
+        frames, leaving, others = self._by_link
+        return layout.columns(frames), layout.entries(leaving), layout.entries(others)
 
     @property
     def newest(self) -> IntArray:
@@ -324,7 +324,8 @@ class InactiveChain(InactiveMap):
         return np.asarray(keys[~are_poses(keys)])
 
     def holds(self, keys: IntArray) -> bool:
-        return any(np.isin(link.factor.keys.keys, keys).any() for link in self.links)
+        held = [NO_KEYS, *(link.factor.keys.keys for link in self.links)]
+        return bool(np.isin(keys, np.concatenate(held)).any())
 
     # --- the frame ---------------------------------------------------------------------------------------
 
@@ -377,11 +378,10 @@ class InactiveChain(InactiveMap):
 
     def _with_poses(self, variables: Variables) -> Variables:
         """Return the variables with the origin and past anchors, as of `refresh`."""
-        known, poses = variables.copy(), self.poses
+        known, poses, unknown = variables.copy(), self.poses, np.zeros(POSE)
         keys = self._pose_keys if self.links else np.array([ORIGIN_KEY])
-        values = [poses.get(key, np.zeros(POSE)) for key in keys.tolist()]
-        reference = np.concatenate(values) * np.repeat(keys != ORIGIN_KEY, POSE)
-        known.insert(keys, np.concatenate(values), reference)
+        values = np.concatenate([poses.get(key, unknown) for key in keys.tolist()])
+        known.insert(keys, values, values * np.repeat(keys != ORIGIN_KEY, POSE))
         return known
 
 
