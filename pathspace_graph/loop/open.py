@@ -23,11 +23,14 @@ from pathspace_graph.loop.lap_solver import Outcome, Unsolved
 from pathspace_graph.mapping.path import HEADING
 from pathspace_graph.mapping.road import Classified, Road
 from pathspace_graph.places.find import (
+    CLOSES_WITHIN,
     NEARBY,
     NEWEST_PATHS,
+    REACH,
     KnownRoad,
     Prior,
     SampledCurves,
+    newest_paths,
     newest_place,
     return_to_beginning,
     revisit_of,
@@ -148,14 +151,22 @@ def open_map(road: Road, poses: Array) -> StartMap:
 
 
 RETURN_CYCLES: Final = 10  # number of cycles between attempts of a vehicle that hardly moves
+ASTRAY: Final = 0.2  # largest error of the position by the path: farther away, no covariance is needed
+SERVES: Final = 10.0  # path on which a covariance serves as the prior (m)
 
 
 class ReturnFinder(Copyable):
-    """Search for a return of an open road, some metres or cycles after the last attempt."""
+    """Search for a return of an open road, some metres or cycles after the last attempt.
+
+    So that no cycle is slow, the covariance of the prior has its own, and so has each length of the newest
+    path.
+    """
 
     def __init__(self, settings: MapperSettings) -> None:
         self._settings = settings
         self._tried = -inf, 0  # path length (m) and cycle of the last attempt
+        self._attempts = 0
+        self._known = -inf, np.zeros((3, 3))  # path length (m) of the newest covariance, and that
         self._rests_until = 0.0  # path length of the next attempt (m)
 
     def rest(self, road: Road, length: float) -> None:
@@ -169,18 +180,27 @@ class ReturnFinder(Copyable):
         waited = length >= tried + closing.check_interval or cycle >= tried_cycle + RETURN_CYCLES
         if length < self._rests_until or not waited:
             return None
-        self._tried = length, cycle
-        curves, smoother = None, road.smoother
+        curves, smoother, poses = None, road.smoother, record.with_newest_path(road, NEWEST_PATHS[-1])
         if self._settings.of_lines:
-            if not road.boundaries or not road.path.near_beginning(road.poses[-1], closing):
-                return None
+            may_return = bool(road.boundaries) and road.path.near_beginning(road.poses[-1], closing)
+        else:
+            away = np.hypot(*(poses[path_lengths(poses) < CLOSES_WITHIN, :2] - poses[-1, :2]).T)
+            may_return = bool(away.min() < REACH[0] + ASTRAY * length)
+        if may_return and length > self._known[0] + SERVES:
+            self._known = length, smoother.newest_covariance()
+            return None
+        self._tried = length, cycle
+        if not may_return:
+            return None
+        if self._settings.of_lines:
             smoother.transform_to_origin()
             smoother.refresh()
             ends = {label: boundary.confirmed_end for label, boundary in road.boundaries.items()}
             curves = SampledCurves.of(smoother.map.state.splines, ends)
+        lengths, self._attempts = newest_paths(length), self._attempts + 1
+        newest = lengths[self._attempts % len(lengths)]
         seen_in = record.seen_in(smoother.variables.sensor, noise)
-        poses = record.with_newest_path(road, NEWEST_PATHS[-1])
-        return return_to_beginning(seen_in, poses, smoother.newest_covariance(), road.settings, curves)
+        return return_to_beginning(seen_in, poses, self._known[1], road.settings, curves, (newest,))
 
 
 # --- other road that is driven again ---------------------------------------------------------------------
