@@ -96,11 +96,11 @@ class Road:
     def expand(self, *, replaced: bool = False) -> str:
         """Grow open curves, and deactivate the part of the map behind; return a notice.
 
-        Where the map is going to be `replaced` in this cycle, nothing of it is deactivated. A cycle that has
+        Neither is worth its time where the map is going to be `replaced` in this cycle. A cycle that has
         grown leaves a stretch to the next ones, if they can wait.
         """
         self.grown, notice = frozenset(), ""
-        if not self.closed:
+        if not self.closed and not replaced:
             path_ahead = self.path.ahead(self.poses[-1], GROWTH_REACH)
             self.grown, notice = self.growth.expand(self.smoother, path_ahead)
             if self.grown:
