@@ -56,24 +56,48 @@ def fix_map(groups: Sequence[Rows]) -> list[Rows]:
     return on_poses
 
 
-def solution(graph: gtsam.GaussianFactorGraph, layout: Layout) -> Array:
-    """Return the solution (n,) of a graph on the variables of a layout.
+def bayes_net(graph: gtsam.GaussianFactorGraph, layout: Layout) -> gtsam.GaussianBayesNet:
+    """Eliminate all variables of a layout: the conditionals are `R' R = H`, with the graph's information H.
 
     Where round-off leaves a pose free, it is eliminated again as in `_eliminated`, from the last pose to the
     first. SingularSystemError where the graph does not determine it, or holds no factor on a variable.
     """
     require_keys(graph, layout)
     try:
-        found = graph.optimize(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
+        tree = graph.eliminateMultifrontal(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
     except RuntimeError:
         poses = are_poses(layout.keys)
         try:
-            found = graph.optimize(gtsam.Ordering([*layout.keys[poses][::-1], *layout.keys[~poses]]))
+            in_turn = gtsam.Ordering([*layout.keys[poses][::-1], *layout.keys[~poses]])
+            tree = graph.eliminateMultifrontal(in_turn)
         except RuntimeError as error:
             raise SingularSystemError(
                 "expected a graph that determines all variables, found one that is free"
             ) from error
-    return np.asarray(found.vector(layout.keys.tolist()))
+    return _net_of(tree)
+
+
+def solution(graph: gtsam.GaussianFactorGraph, layout: Layout) -> Array:
+    """Return the solution (n,) of a graph on the variables of a layout. Raises as `bayes_net` does."""
+    return np.asarray(bayes_net(graph, layout).optimize().vector(layout.keys.tolist()))
+
+
+def newton_step(net: gtsam.GaussianBayesNet, groups: Sequence[Rows], layout: Layout) -> tuple[Array, float]:
+    """Return the step (n,) `-H^-1 g` of rows with gradient `g = J' r`, by the information H of a net.
+
+    The second result is the decrease `1/2 g' H^-1 g` that it predicts: 1/2 for a step of one sigma. The net
+    is that of these rows, or of rows at a point nearby.
+    """
+    gradient, own = np.zeros(layout.size), gtsam.VectorValues()
+    for rows in groups:
+        by_row = (rows.jacobian * rows.residual[:, None]).ravel()
+        gradient += np.bincount(rows.columns(layout).ravel(), by_row, layout.size)
+    places = zip(layout.keys.tolist(), layout.starts.tolist(), layout.widths.tolist(), strict=True)
+    for key, start, width in places:
+        own.insert(key, -gradient[start : start + width])
+    found = net.backSubstitute(net.backSubstituteTranspose(own))
+    step = np.asarray(found.vector(layout.keys.tolist()))
+    return step, -0.5 * float(gradient @ step)
 
 
 class Elimination:
@@ -207,7 +231,12 @@ def _eliminated(
             raise SingularSystemError(
                 "expected poses that the graph determines, found one that is free"
             ) from error
+    return _net_of(tree), remaining
+
+
+def _net_of(tree: gtsam.GaussianBayesTree) -> gtsam.GaussianBayesNet:
+    """Return the conditionals of a tree, which gives its root first, with the root last."""
     net = gtsam.GaussianBayesNet()
-    for conditional in reversed(factors_of(graph_of(tree))):  # a tree gives its root first
+    for conditional in reversed(factors_of(graph_of(tree))):
         net.push_back(cast("gtsam.GaussianConditional", conditional))
-    return net, remaining
+    return net

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners, solution
+from pathspace_graph.graph.elimination import (
+    Elimination,
+    bayes_net,
+    fix_map,
+    linear_graph,
+    newton_step,
+    owners,
+    solution,
+)
 from pathspace_graph.graph.gaussian import cholesky
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import (
@@ -88,6 +96,24 @@ def test_the_solution_is_that_of_the_dense_system(seed: int, poses: int, points:
     matrix, right = dense(groups, variables.layout)
     found = solution(linear_graph(groups, variables), variables.layout)
     np.testing.assert_allclose(found, np.linalg.solve(matrix, right), atol=1e-7)
+
+
+@given(*SIZES)
+def test_a_step_has_the_gradient_of_its_rows_and_the_information_of_a_net(
+    seed: int, poses: int, points: int
+) -> None:
+    """The net of other rows on the same variables gives a step of its own information."""
+    rng = np.random.default_rng(seed)
+    variables, groups = random_variables(rng, poses, points), random_rows(rng, poses, points)
+    others = random_rows(rng, poses, points)
+    _, right = dense(groups, variables.layout)
+    for held in (groups, others):
+        matrix, _ = dense(held, variables.layout)
+        net = bayes_net(linear_graph(held, variables), variables.layout)
+        step, decrease = newton_step(net, groups, variables.layout)
+        expected = np.linalg.solve(matrix, right)
+        np.testing.assert_allclose(step, expected, atol=1e-6)
+        assert decrease == pytest.approx(0.5 * right @ expected, rel=1e-6)
 
 
 def test_the_order_of_the_second_try_gives_the_same_solution(monkeypatch: pytest.MonkeyPatch) -> None:
