@@ -204,9 +204,7 @@ class MeasuredNoise:
         errors, points = self.shown if shown else self.sensor, self.unbent(points)
         if not errors.any():
             return points
-        twists = np.empty((len(points), 3))
-        twists[:] = twist  # ten times faster than `broadcast_to`
-        return kernels.shifted(points, twists, errors)
+        return kernels.shifted(points, np.full((len(points), 3), twist), errors)
 
 
 def ray_axes(points: Array) -> Array:

@@ -159,10 +159,7 @@ class AlignedOdometry:
 
 
 def aligned_odometry(
-    chain: LogOdometry,
-    revisits: Sequence[Revisit],
-    begin: AlignedOdometry | None = None,
-    last: int | None = None,
+    chain: LogOdometry, revisits: Sequence[Revisit], begin: AlignedOdometry | None = None, last: int = -1
 ) -> AlignedOdometry:
     """Find the optimum of odometry and revisits by Gauss-Newton, from another one or dead reckoning.
 
@@ -173,7 +170,7 @@ def aligned_odometry(
     poses = chain.dead_reckoned(calibration) if begin is None else begin.poses
     ends = np.array([(one.earlier, one.later) for one in revisits], np.intp).reshape(-1, 2)
     _, regular = np.unique(path_lengths(poses) // NODE_STEP, return_index=True)
-    last = len(poses) - 1 if last is None else last
+    last = last % len(poses)
     nodes = np.unique(np.concatenate([regular[regular < last], ends.ravel(), [last]]))
     odometry = copy(chain.odometry)
     odometry.compose_between(nodes)

@@ -26,15 +26,7 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square, sensor_prior
-from pathspace_graph.graph.elimination import (
-    Elimination,
-    bayes_net,
-    fix_map,
-    linear_graph,
-    newton_step,
-    owners,
-    solution,
-)
+from pathspace_graph.graph.elimination import Elimination, bayes_net, fix_map, linear_graph, owners, step_by
 from pathspace_graph.graph.rows import Revisit, Rows, at_values, by_widths, odometry_factor, revisit_rows
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
@@ -305,9 +297,9 @@ class BatchSystem:
 
     def poses_alone(self, at: Evaluation) -> Array:
         """Step (3 P,) of the poses with fixed map and calibration."""
-        keys = at.state.variables.keys
-        graph = linear_graph(fix_map(self.rows(at)), at.state.variables)
-        return solution(graph, Layout(keys[are_poses(keys)]))
+        rows, variables = fix_map(self.rows(at)), at.state.variables
+        layout = Layout(variables.keys[are_poses(variables.keys)])
+        return step_by(bayes_net(linear_graph(rows, variables), layout), rows, layout)[0]
 
 
 def seen_after_step(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
@@ -392,7 +384,7 @@ GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down
 CHANGED_SHARE: Final = 1e-3  # largest share of detections that change in the last round of associations
 SIGMAS_DAMPED: Final = (10.0, 1.0, 0.1)  # of a step of a control point beside its pose, while singular (m)
 TOLERANCE_DECREASE: Final = 0.05  # largest predicted decrease of the cost in the last step; one sigma is 1/2
-GAIN: Final = 0.8  # least decrease, relative to the predicted one, by an information that is kept
+GAIN: Final = 0.8  # least decrease of the cost, relative to the predicted one, to keep the information
 ROUGH_TOLERANCE: Final = 100.0  # factor of the tolerance while knots or stations still change
 CREEP_SHARES: Final = (0.3, 0.97)  # ratio of a step to the last one between which it is extrapolated
 
@@ -486,9 +478,9 @@ class Optimizer:
                     locate_poses(state)
                 changed = system.associate(state, gate, strict)
                 at = system.evaluate(state, hold=True)
-                settled = changed <= CHANGED_SHARE * len(system.detections)
+                settled = strict and changed <= CHANGED_SHARE * len(system.detections)
                 self._net = self._net if settled else None
-                searching = not (strict and (settled or done > rounds // 2))
+                searching = not (settled or (strict and done > rounds // 2))
             at, decrease = self._step(at)
             stuck, state = not searching and at.state is state, at.state
             if self._on_round is not None:
@@ -503,10 +495,10 @@ class Optimizer:
     def _step(self, at: Evaluation) -> tuple[Evaluation, float]:
         """Take a Gauss-Newton step, halved until the cost does not grow; return the decrease it predicts.
 
-        The problem stays as it is if no part of the step decreases the cost. An information is kept as long
-        as it predicts the decrease well: the next step has only a new gradient. On a long road, a whole step
-        turns the map by more than its linearization holds for, and round-off may leave a control point free:
-        then the step is damped, and the decrease infinite, since it may be short without convergence.
+        The problem stays as it is if no part of the step decreases the cost. While the information of a step
+        predicts the decrease well, the next one has only a new gradient. On a long road, a whole step turns
+        the map by more than its linearization holds for, and round-off may leave a control point free: then
+        the step is damped, and the decrease infinite, since it may be short without convergence.
         """
         system, state, layout, cost = self.system, at.state, at.state.variables.layout, at.cost
         system.detections.refine(at.across.rows, at.u)  # later evaluations refine these foot points
@@ -519,7 +511,7 @@ class Optimizer:
             except SingularSystemError:
                 if sigma == SIGMAS_DAMPED[-1]:
                     raise
-        step, decrease = newton_step(net, rows, layout)
+        step, decrease = step_by(net, rows, layout)
         decrease = np.inf if damped else decrease
         before, self._last_step = self._last_step, None
         for share in 0.5 ** np.arange(8):

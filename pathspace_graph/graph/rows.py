@@ -124,17 +124,13 @@ def among(keys: IntArray, ascending: IntArray) -> BoolArray:
     return np.asarray(ascending.take(ascending.searchsorted(keys), mode="clip") == keys)
 
 
-def stacked_rows(groups: Sequence[Rows]) -> Rows:
-    """Return the rows of groups on variables of the same widths as one group."""
-    return Rows(*map(np.concatenate, zip(*(rows.parts for rows in groups), strict=True)))
-
-
 def by_widths(groups: Sequence[Rows]) -> list[Rows]:
     """Return few groups: one for all rows on variables of the same widths."""
     alike: dict[tuple[int, ...], list[Rows]] = {}
     for rows in groups:
         alike.setdefault(rows.widths, []).append(rows)
-    return [stacked_rows(same) for same in alike.values()]
+    parts = (zip(*(rows.parts for rows in same), strict=True) for same in alike.values())
+    return [Rows(*map(np.concatenate, columns)) for columns in parts]
 
 
 def newton_system(

@@ -23,7 +23,7 @@ from pathspace_graph.batch.system import (
     extrapolation_factor,
 )
 from pathspace_graph.errors import SingularSystemError
-from pathspace_graph.graph.elimination import bayes_net, newton_step
+from pathspace_graph.graph.elimination import bayes_net, step_by
 from pathspace_graph.mapping.state import State
 from pathspace_graph.settings.mapper import MapperSettings
 
@@ -90,7 +90,7 @@ def test_it_ends_where_nothing_changes_any_more() -> None:
 def decrease_and_step(system: BatchSystem, at: Evaluation) -> tuple[float, Array]:
     """Returns the undamped step at a state, and the decrease of the cost that it predicts."""
     layout = at.state.variables.layout
-    step, decrease = newton_step(bayes_net(system.linear_graph(at), layout), system.rows(at), layout)
+    step, decrease = step_by(bayes_net(system.linear_graph(at), layout), system.rows(at), layout)
     return decrease, step
 
 
@@ -184,9 +184,9 @@ def times_its_length(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Multiply every step, with a predicted decrease that is no end."""
 
     def wrong(*problem: Any) -> tuple[NDArray[np.float64], float]:
-        return factor * newton_step(*problem)[0], 1.0
+        return factor * step_by(*problem)[0], 1.0
 
-    monkeypatch.setattr("pathspace_graph.batch.system.newton_step", wrong)
+    monkeypatch.setattr("pathspace_graph.batch.system.step_by", wrong)
 
 
 def test_steps_share_an_information_that_predicts_the_decrease(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -220,11 +220,11 @@ def test_where_an_older_information_leads_nowhere_the_step_gets_its_own(
     optimizer._net = bayes_net(system.linear_graph(at), at.state.variables.layout)
 
     def first_uphill(*problem: Any) -> tuple[NDArray[np.float64], float]:
-        step, decrease = newton_step(*problem)
+        step, decrease = step_by(*problem)
         steps.append(decrease)
         return (-step if len(steps) == 1 else step), decrease
 
-    monkeypatch.setattr("pathspace_graph.batch.system.newton_step", first_uphill)
+    monkeypatch.setattr("pathspace_graph.batch.system.step_by", first_uphill)
     after, _ = optimizer._step(at)
     assert len(steps) == 2
     assert after.cost < at.cost
