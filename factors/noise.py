@@ -52,6 +52,7 @@ ASSUMED_DRIFT: Final = (0.05, 0.05, 0.0017)
 
 It is not observable on an open drive: a cone is in view for about 3 s, and the noise of its detections hides
 an error of the speed below 0.05 m/s."""
+TINY: Final = float(np.finfo(float).tiny)  # smallest divisor of lengths, which are zero where it counts
 SURE: Final = 4.0  # sigmas from which an error of the sensor is significant
 STAYS: Final = 1.5  # growth of the sigma of a cone's mean from which correlated errors count
 
@@ -89,7 +90,7 @@ class RayNoise:
         """
         times = period * (np.arange(count) - 0.5 * (count - 1))
         alike = self.share * np.exp(-np.abs(times[:, None] - times) / self.time)
-        return float(1.0 - self.share + times @ alike @ times / max(times @ times, np.finfo(float).tiny))
+        return float(1.0 - self.share + times @ alike @ times / max(times @ times, TINY))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,12 +162,16 @@ class MeasuredNoise:
         """
         if self.along is None or self.across is None:
             return None
-        ranges, ray = np.hypot(points[:, 0], points[:, 1]), ray_axes(points)[:, 0]
-        factors = self._inflations if inflated else np.ones(2)
+        ranges = np.hypot(points[:, 0], points[:, 1])
+        ray, factors = (
+            points / np.maximum(ranges, TINY)[:, None],
+            self._inflations if inflated else (1.0, 1.0),
+        )
         along = factors[0] * self.along.sigmas(ranges) ** 2
         across = factors[1] * self.across.sigmas(ranges) ** 2
-        outer = ray[:, :, None] * ray[:, None, :]
-        return np.asarray(across[:, None, None] * np.eye(2) + (along - across)[:, None, None] * outer)
+        covariances = (along - across)[:, None, None] * (ray[:, :, None] * ray[:, None, :])
+        covariances[:, [0, 1], [0, 1]] += across[:, None]
+        return np.asarray(covariances)
 
     def inflated(self, points: Array, covariances: Array) -> Array:
         """Inflate covariances C (m, 2, 2) of single detections, so that sightings count as independent.
@@ -199,12 +204,12 @@ class MeasuredNoise:
         errors, points = self.shown if shown else self.sensor, self.unbent(points)
         if not errors.any():
             return points
-        return kernels.shifted(points, np.broadcast_to(twist, (len(points), 3)), errors)
+        return kernels.shifted(points, np.full((len(points), 3), twist), errors)
 
 
 def ray_axes(points: Array) -> Array:
     """Unit vectors (m, 2, 2) along and across the rays to points (m, 2), vehicle frame."""
-    ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), np.finfo(float).tiny)[:, None]
+    ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), TINY)[:, None]
     return np.stack([ray, left_of(ray)], axis=1)
 
 

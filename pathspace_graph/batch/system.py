@@ -18,7 +18,6 @@ from pathspace_graph.batch.association import (
 )
 from pathspace_graph.batch.simplification import reknot
 from pathspace_graph.errors import SettingsError, SingularSystemError
-from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.footpoint import FootPoints
 from pathspace_graph.factors.linear import keys_of_factor
@@ -27,7 +26,7 @@ from pathspace_graph.factors.odometry import CALIBRATION_SIZE
 from pathspace_graph.factors.se2 import rotation, to_map
 from pathspace_graph.factors.sensor import SENSOR_SIZE
 from pathspace_graph.front_end.log_odometry import LogOdometry, half_square, sensor_prior
-from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners, solution
+from pathspace_graph.graph.elimination import Elimination, bayes_net, fix_map, linear_graph, owners, step_by
 from pathspace_graph.graph.rows import Revisit, Rows, at_values, by_widths, odometry_factor, revisit_rows
 from pathspace_graph.graph.variables import (
     CALIBRATION_KEY,
@@ -298,9 +297,9 @@ class BatchSystem:
 
     def poses_alone(self, at: Evaluation) -> Array:
         """Step (3 P,) of the poses with fixed map and calibration."""
-        keys = at.state.variables.keys
-        graph = linear_graph(fix_map(self.rows(at)), at.state.variables)
-        return solution(graph, Layout(keys[are_poses(keys)]))
+        rows, variables = fix_map(self.rows(at)), at.state.variables
+        layout = Layout(variables.keys[are_poses(variables.keys)])
+        return step_by(bayes_net(linear_graph(rows, variables), layout), rows, layout)[0]
 
 
 def seen_after_step(points: Array, poses: Array, points_after: Array, poses_after: Array) -> Array:
@@ -385,6 +384,7 @@ GATE_FACTOR: Final = 0.7  # factor of the gate from each round to the next, down
 CHANGED_SHARE: Final = 1e-3  # largest share of detections that change in the last round of associations
 SIGMAS_DAMPED: Final = (10.0, 1.0, 0.1)  # of a step of a control point beside its pose, while singular (m)
 TOLERANCE_DECREASE: Final = 0.05  # largest predicted decrease of the cost in the last step; one sigma is 1/2
+GAIN: Final = 0.8  # least decrease of the cost, relative to the predicted one, to keep the information
 ROUGH_TOLERANCE: Final = 100.0  # factor of the tolerance while knots or stations still change
 CREEP_SHARES: Final = (0.3, 0.97)  # ratio of a step to the last one between which it is extrapolated
 
@@ -434,6 +434,7 @@ class Optimizer:
         self.effort, self._on_round = effort or Effort(), on_round
         self.steps = 0  # number of steps tried
         self._last_step: Array | None = None  # last step of the map and the calibration
+        self._net: gtsam.GaussianBayesNet | None = None  # information of an earlier step, for the next one
 
     def find(self, state: State) -> tuple[Evaluation, Convergence]:
         """Find the optimum on curves with about one knot for each cone, which meet the cones.
@@ -468,7 +469,7 @@ class Optimizer:
             state = reknot(state, system.detections, system.settings)
         locate_poses(state)
         system.begin(state, stage.stations)
-        self._last_step, searching, converged, stuck, done = None, True, False, False, 0
+        self._net, self._last_step, searching, converged, stuck, done = None, None, True, False, False, 0
         while not (converged or stuck) and done < rounds:
             done, gate = done + 1, max(gate, self.settings.gate)
             strict = gate <= self.settings.gate
@@ -477,8 +478,9 @@ class Optimizer:
                     locate_poses(state)
                 changed = system.associate(state, gate, strict)
                 at = system.evaluate(state, hold=True)
-                settled = changed <= CHANGED_SHARE * len(system.detections) or done > rounds // 2
-                searching = not (strict and settled)
+                settled = strict and changed <= CHANGED_SHARE * len(system.detections)
+                self._net = self._net if settled else None
+                searching = not (settled or (strict and done > rounds // 2))
             at, decrease = self._step(at)
             stuck, state = not searching and at.state is state, at.state
             if self._on_round is not None:
@@ -493,9 +495,10 @@ class Optimizer:
     def _step(self, at: Evaluation) -> tuple[Evaluation, float]:
         """Take a Gauss-Newton step, halved until the cost does not grow; return the decrease it predicts.
 
-        The problem stays as it is if no part of the step decreases the cost. On a long road, a whole step
-        turns the map by more than its linearization holds for, and round-off may leave a control point free:
-        then the step is damped, and the decrease infinite, since it may be short without convergence.
+        The problem stays as it is if no part of the step decreases the cost. While the information of a step
+        predicts the decrease well, the next one has only a new gradient. On a long road, a whole step turns
+        the map by more than its linearization holds for, and round-off may leave a control point free: then
+        the step is damped, and the decrease infinite, since it may be short without convergence.
         """
         system, state, layout, cost = self.system, at.state, at.state.variables.layout, at.cost
         system.detections.refine(at.across.rows, at.u)  # later evaluations refine these foot points
@@ -503,12 +506,13 @@ class Optimizer:
         for sigma in (np.inf, *SIGMAS_DAMPED):
             damped = system.damping(state, sigma) if sigma < np.inf else []
             try:
-                step = solution(linear_graph([*rows, *damped], state.variables), layout)
+                net = self._net or bayes_net(linear_graph([*rows, *damped], state.variables), layout)
                 break
             except SingularSystemError:
                 if sigma == SIGMAS_DAMPED[-1]:
                     raise
-        decrease = np.inf if damped else predicted_decrease(rows, layout, step)
+        step, decrease = step_by(net, rows, layout)
+        decrease = np.inf if damped else decrease
         before, self._last_step = self._last_step, None
         for share in 0.5 ** np.arange(8):
             self.steps += 1
@@ -516,7 +520,11 @@ class Optimizer:
             if trial.cost <= cost:
                 break
         else:
-            return at, decrease
+            if self._net is None:
+                return at, decrease
+            self._net = None
+            return self._step(at)
+        self._net = net if cost - trial.cost > GAIN * decrease else None
         if share == 1.0:
             self._last_step = step[: layout.size - state.poses.size]
             factor = 1.0 if before is None else extrapolation_factor(self._last_step, before)
@@ -537,13 +545,3 @@ def extrapolation_factor(step: Array, before: Array) -> float:
     square = float(before @ before)
     share = float(step @ before) / square if square > 0.0 else 0.0
     return 1.0 / (1.0 - share) if CREEP_SHARES[0] < abs(share) < CREEP_SHARES[1] else 1.0
-
-
-def predicted_decrease(groups: Sequence[Rows], layout: Layout, step: Array) -> float:
-    """Decrease `1/2 |r|^2 - 1/2 |J d + r|^2` of all rows by a step d (n,), for the linear problem.
-
-    For an undamped step it is `1/2 g' H^-1 g`, with gradient g and information H: 1/2 for a step of one
-    sigma.
-    """
-    after = (kernels.moved_residual(layout, rows, -step) for rows in groups if len(rows))
-    return half_square(groups) - sum(0.5 * float(residual @ residual) for residual in after)

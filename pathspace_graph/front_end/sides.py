@@ -134,7 +134,7 @@ class SideJudge(Copyable):
         labels = detections.labels
         unknown = int(np.count_nonzero(labels == UNKNOWN))
         self._counts = 0.98 * self._counts + [len(labels) - unknown, unknown]
-        total, sides = self._counts.sum(), np.full(len(labels), UNKNOWN)
+        total, sides = self._counts.sum(), np.array(UNKNOWN)
         self.colourless = bool(total >= 6 and self._counts[1] > self.settings.colourless * total)
         if self.colourless or self._agreeing + self._opposing < 30:
             self._path = self._path or DrivenPath()
@@ -152,7 +152,7 @@ class SideJudge(Copyable):
         else:
             self._path = None  # a new path begins if it is needed again
         coloured = LEFT + RIGHT - labels if self.swapped else labels
-        return np.where(labels == UNKNOWN, sides, coloured)
+        return np.where(labels == UNKNOWN, sides, coloured) if unknown else coloured
 
     def _judge_colours(self, path: PathAhead) -> None:
         """Count the vote of each cone once, and swap colours by three votes and 2.5 times the others."""

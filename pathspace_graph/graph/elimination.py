@@ -21,7 +21,7 @@ from pathspace_graph.factors.arrays import Array, IntArray
 
 from .gaussian import factorize, factors_of, graph_of, keys_of, normal_equations, require_keys
 from .rows import Rows, jacobian_factors
-from .variables import POSE, Layout, Variables, are_poses, indices, pose_keys, sizes
+from .variables import NO_KEYS, POSE, Layout, Variables, are_poses, indices, pose_keys, sizes
 
 POSES_IN_FACTOR: Final = 8
 """Few factors are cheap to create, narrow ones to eliminate; 5 to 10 poses take alike. All rows of a graph
@@ -56,24 +56,36 @@ def fix_map(groups: Sequence[Rows]) -> list[Rows]:
     return on_poses
 
 
-def solution(graph: gtsam.GaussianFactorGraph, layout: Layout) -> Array:
-    """Return the solution (n,) of a graph on the variables of a layout.
+def bayes_net(graph: gtsam.GaussianFactorGraph, layout: Layout) -> gtsam.GaussianBayesNet:
+    """Eliminate all variables of a layout: the conditionals are `R' R = H`, with the graph's information H.
 
-    Where round-off leaves a pose free, it is eliminated again as in `_eliminated`, from the last pose to the
-    first. SingularSystemError where the graph does not determine it, or holds no factor on a variable.
+    SingularSystemError where the graph does not determine it, or holds no factor on a variable.
     """
     require_keys(graph, layout)
-    try:
-        found = graph.optimize(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
-    except RuntimeError:
-        poses = are_poses(layout.keys)
-        try:
-            found = graph.optimize(gtsam.Ordering([*layout.keys[poses][::-1], *layout.keys[~poses]]))
-        except RuntimeError as error:
-            raise SingularSystemError(
-                "expected a graph that determines all variables, found one that is free"
-            ) from error
-    return np.asarray(found.vector(layout.keys.tolist()))
+    return _eliminated(graph, Layout(NO_KEYS), len(layout.keys))[0]
+
+
+def solution(graph: gtsam.GaussianFactorGraph, layout: Layout) -> Array:
+    """Return the solution (n,) of a graph on the variables of a layout. Raises as `bayes_net` does."""
+    return np.asarray(bayes_net(graph, layout).optimize().vector(layout.keys.tolist()))
+
+
+def step_by(net: gtsam.GaussianBayesNet, groups: Sequence[Rows], layout: Layout) -> tuple[Array, float]:
+    """Return the step (n,) `-H^-1 g` of rows with gradient `g = J' r`, by the information H of a net.
+
+    The second result is the decrease `1/2 g' H^-1 g` that it predicts: 1/2 for a step of one sigma. The net
+    is that of these rows, or of rows at a point nearby.
+    """
+    gradient, own = np.zeros(layout.size), gtsam.VectorValues()
+    for rows in groups:
+        by_row = (rows.jacobian * rows.residual[:, None]).ravel()
+        gradient += np.bincount(rows.columns(layout).ravel(), by_row, layout.size)
+    places = zip(layout.keys.tolist(), layout.starts.tolist(), layout.widths.tolist(), strict=True)
+    for key, start, width in places:
+        own.insert(key, -gradient[start : start + width])
+    found = net.backSubstitute(net.backSubstituteTranspose(own))
+    step = np.asarray(found.vector(layout.keys.tolist()))
+    return step, -0.5 * float(gradient @ step)
 
 
 class Elimination:
@@ -190,22 +202,22 @@ def marginal_before(groups: Sequence[Rows], variables: Variables, first: int) ->
 def _eliminated(
     graph: gtsam.GaussianFactorGraph, others: Layout, count: int
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
-    """Return the conditionals of `count` poses, the root last, and the graph that remains on the others.
+    """Return the conditionals of `count` variables, the root last, and the graph that remains on the others.
 
     GTSAM may take poses for free that are certain relative to each other alone, as those of a vehicle that
     rests far from its start. Eliminated from the last pose to the first, they hang on those before them.
     """
     order = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(graph, others.keys.tolist(), False)
-    poses = [order.at(k) for k in range(count)]
+    keys = [order.at(k) for k in range(count)]
     try:
-        tree, remaining = graph.eliminatePartialMultifrontal(gtsam.Ordering(poses))
+        tree, remaining = graph.eliminatePartialMultifrontal(gtsam.Ordering(keys))
     except RuntimeError:
         try:
-            in_turn = gtsam.Ordering(sorted(poses, reverse=True))
+            in_turn = gtsam.Ordering(sorted(keys, reverse=True))
             tree, remaining = graph.eliminatePartialMultifrontal(in_turn)
         except RuntimeError as error:
             raise SingularSystemError(
-                "expected poses that the graph determines, found one that is free"
+                "expected a graph that determines poses and map, found a variable that is free"
             ) from error
     net = gtsam.GaussianBayesNet()
     for conditional in reversed(factors_of(graph_of(tree))):  # a tree gives its root first

@@ -163,6 +163,12 @@ class BSpline:
         """Basis as polynomials on each span."""
         return bspline.SpanPolynomials(self.knots, self.degree, self.periodic)
 
+    @cached_property
+    def energy(self) -> csr_array:
+        """Matrix E (m, m) with `c' E c` the bending energy of distinct control points c (`energy_rows`)."""
+        R = energy_rows(self)
+        return csr_array(R.T @ R)
+
     def with_points(self, distinct: Array) -> Self:
         """Return the curve of the same basis with other distinct control points (m, 2)."""
         points = np.concatenate([distinct, distinct[: self.degree]]) if self.periodic else distinct
@@ -381,8 +387,8 @@ class LeastSquares:
     """
 
     def __init__(self, spline: BSpline, u: Array, weight: float) -> None:
-        self.basis, R = sparse_rows(*spline.local_basis(u), spline.size), energy_rows(spline)
-        self.normal: SuperLU = splu(csc_array(self.basis.T @ self.basis + weight * (R.T @ R)))
+        self.basis = sparse_rows(*spline.local_basis(u), spline.size)
+        self.normal: SuperLU = splu(csc_array(self.basis.T @ self.basis + weight * spline.energy))
 
     def solve(self, values: Array | csr_array) -> Array:
         """Return the control points (m, d) of values (k, d) at the parameters."""
@@ -416,11 +422,11 @@ def fit_spline(points: Array, breaks: Array | int, periodic: bool, degree: int =
         if count < 1 or (periodic and count <= degree):
             raise SettingsError(f"{breaks} control points are too few for a spline of degree {degree}")
         breaks = np.linspace(0.0, lengths[-1], count + 1)
-    spline, feet = _frame(breaks, periodic, degree), lengths[: len(points)]
+    frame, feet = _frame(breaks, periodic, degree), lengths[: len(points)]
     reach = (breaks[-1] - breaks[0]) / max(len(breaks) - 1, len(points))
     for _ in range(4):  # with refreshed foot points
         u = feet
-        spline = spline.with_points(LeastSquares(spline, u, ENERGY_WEIGHT).solve(points))
+        spline = frame.with_points(LeastSquares(frame, u, ENERGY_WEIGHT).solve(points))
         search = u - reach, u + reach, 0.1 * reach
         feet = foot_points(spline.tables, spline.control_points, points, *search).u
     return spline, u

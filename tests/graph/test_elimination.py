@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 
 from pathspace_graph.errors import SingularSystemError
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.graph.elimination import Elimination, fix_map, linear_graph, owners, solution
+from pathspace_graph.graph.elimination import (
+    Elimination,
+    bayes_net,
+    fix_map,
+    linear_graph,
+    owners,
+    solution,
+    step_by,
+)
 from pathspace_graph.graph.gaussian import cholesky
 from pathspace_graph.graph.rows import Rows
 from pathspace_graph.graph.variables import (
@@ -90,18 +98,42 @@ def test_the_solution_is_that_of_the_dense_system(seed: int, poses: int, points:
     np.testing.assert_allclose(found, np.linalg.solve(matrix, right), atol=1e-7)
 
 
+@given(*SIZES)
+def test_a_step_has_the_gradient_of_its_rows_and_the_information_of_a_net(
+    seed: int, poses: int, points: int
+) -> None:
+    """The net of other rows on the same variables gives a step of its own information."""
+    rng = np.random.default_rng(seed)
+    variables, groups = random_variables(rng, poses, points), random_rows(rng, poses, points)
+    others = random_rows(rng, poses, points)
+    _, right = dense(groups, variables.layout)
+    for held in (groups, others):
+        matrix, _ = dense(held, variables.layout)
+        net = bayes_net(linear_graph(held, variables), variables.layout)
+        step, decrease = step_by(net, groups, variables.layout)
+        expected = np.linalg.solve(matrix, right)
+        np.testing.assert_allclose(step, expected, atol=1e-6)
+        assert decrease == pytest.approx(0.5 * right @ expected, rel=1e-6)
+
+
 def test_the_order_of_the_second_try_gives_the_same_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is taken where GTSAM finds a pose free in its own order."""
+    orders, eliminate = list[gtsam.Ordering](), gtsam.GaussianFactorGraph.eliminatePartialMultifrontal
 
-    def free(*_: object) -> None:
-        raise RuntimeError
+    def free_at_first(graph: gtsam.GaussianFactorGraph, order: gtsam.Ordering) -> object:
+        orders.append(order)
+        if len(orders) == 1:
+            raise RuntimeError
+        return eliminate(graph, order)
 
     rng = np.random.default_rng(5)
     variables, groups = random_variables(rng, 30, 5), random_rows(rng, 30, 5)
     graph = linear_graph(groups, variables)
     expected = solution(graph, variables.layout)
-    monkeypatch.setattr(gtsam.Ordering, "ColamdGaussianFactorGraph", free)
+    monkeypatch.setattr(gtsam.GaussianFactorGraph, "eliminatePartialMultifrontal", free_at_first)
     np.testing.assert_allclose(solution(graph, variables.layout), expected, atol=1e-9)
+    first, second = ([order.at(k) for k in range(order.size())] for order in orders)
+    assert second == sorted(first, reverse=True)
 
 
 def test_poses_given_a_fixed_map() -> None:
