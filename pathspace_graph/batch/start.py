@@ -142,7 +142,7 @@ class AlignedOdometry:
 
     poses: Array  # (P, 3) poses of all cycles, dead reckoned from the last node
     calibration: Array  # (2,) calibration of the odometry
-    nodes: IntArray  # (k,) cycles of the nodes, the first one among them
+    nodes: IntArray  # (k,) cycles of the nodes, the first and the last cycle among them
     graph: gtsam.GaussianFactorGraph  # as linearized in the last step; pose j is the one of node j
     layout: Layout
 
@@ -159,19 +159,17 @@ class AlignedOdometry:
 
 
 def aligned_odometry(
-    chain: LogOdometry, revisits: Sequence[Revisit], begin: AlignedOdometry | None = None, last: int = -1
+    chain: LogOdometry, revisits: Sequence[Revisit], begin: AlignedOdometry | None = None
 ) -> AlignedOdometry:
     """Find the optimum of odometry and revisits by Gauss-Newton, from another one or dead reckoning.
 
-    The ends of revisits are nodes, and so is the `last` cycle, by default that of the drive: what follows has
-    only odometry. The odometry between nodes is one factor.
+    The ends of revisits are nodes. The odometry between nodes is one factor.
     """
     calibration = chain.calibration_mean if begin is None else begin.calibration
     poses = chain.dead_reckoned(calibration) if begin is None else begin.poses
     ends = np.array([(one.earlier, one.later) for one in revisits], np.intp).reshape(-1, 2)
     _, regular = np.unique(path_lengths(poses) // NODE_STEP, return_index=True)
-    last = last % len(poses)
-    nodes = np.unique(np.concatenate([regular[regular < last], ends.ravel(), [last]]))
+    nodes = np.unique(np.concatenate([regular, ends.ravel(), [len(poses) - 1]]))
     odometry = copy(chain.odometry)
     odometry.compose_between(nodes)
     between = replace(chain, stamps=chain.stamps[nodes], odometry=odometry, twists=chain.twists[nodes])
@@ -190,8 +188,8 @@ def aligned_odometry(
         if np.abs(step).max() < ALIGN_TOLERANCE:
             break
     reckoned = chain.dead_reckoned(variables.calibration)
-    node = nodes.searchsorted(np.arange(len(poses)), side="right") - 1
-    poses = compose(variables.poses[node], relative(reckoned[nodes[node]], reckoned))
+    last = nodes.searchsorted(np.arange(len(poses)), side="right") - 1
+    poses = compose(variables.poses[last], relative(reckoned[nodes[last]], reckoned))
     return AlignedOdometry(poses, variables.calibration, nodes, graph, variables.layout)
 
 
@@ -236,7 +234,7 @@ def find_revisits(judged: JudgedLog) -> tuple[Revisit, ...]:
         revisits.append(revisit)
         off = difference(relative(poses[revisit.earlier], poses[revisit.later]), revisit.local)
         if float(np.square(off / NEARBY[0]).sum()) > OFF**2:
-            aligned = aligned_odometry(chain, revisits, aligned, newest)
+            aligned = aligned_odometry(chain, revisits, aligned)
             poses = aligned.poses
         due = driven[newest] + REVISIT_INTERVAL
     return tuple(revisits)

@@ -184,22 +184,20 @@ class OdometryChain:
         self.by_calibration = self.by_calibration[1:]
 
     def compose_between(self, cycles: IntArray) -> None:
-        """Compose the intervals between some cycles (k,), the first one among them, to one each.
+        """Compose the intervals between some cycles (k,), the first and the last one among them, to one each.
 
-        Those after the last one are left out. An error e_i at the end of interval i moves the end of the
-        composition by `Ad(T_end^-1 T_i) e_i`.
+        An error e_i at the end of interval i moves the end of the composition by `Ad(T_end^-1 T_i) e_i`.
         """
-        used = slice(cycles[-1])
-        poses = accumulated(np.concatenate([np.zeros((1, POSE)), self.deltas[used]]))
+        poses = accumulated(np.concatenate([np.zeros((1, POSE)), self.deltas]))
         x, y, theta = relative(poses[np.repeat(cycles[1:], np.diff(cycles))], poses[1:]).T
         adjoint = np.zeros((len(theta), POSE, POSE))
         adjoint[:, :2, :2] = se2.rotations(theta)
         adjoint[:, :, 2] = np.column_stack([y, -x, np.ones(len(theta))])
-        root = adjoint @ np.linalg.inv(self.whiteners[used])
+        root = adjoint @ np.linalg.inv(self.whiteners)
         covariances = np.add.reduceat(root @ root.transpose(0, 2, 1), cycles[:-1])
         self.deltas = relative(poses[cycles[:-1]], poses[cycles[1:]])
         self.whiteners = np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)), np.float64)
-        self.by_calibration = np.add.reduceat(adjoint @ self.by_calibration[used], cycles[:-1])
+        self.by_calibration = np.add.reduceat(adjoint @ self.by_calibration, cycles[:-1])
 
     def terms(self, slots: IntArray | slice, poses: Array, calibration: Array) -> tuple[Array, Array]:
         """Return `W_k (Log(delta_k^-1 x_k^-1 x_{k+1}) + G_k b)` (m, 3) of some intervals k, and derivatives.
