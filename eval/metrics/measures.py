@@ -261,7 +261,8 @@ def _laps(run: RunResult, log: Log) -> Iterator[tuple[int, Map, float, float]]:
     maps = tuple(enumerate(run.snapshots, start=1))
     if not (true_laps and maps):
         maps, ends = run.lap_maps, ends[:1]
-        ends += [max(record.t for record in run.cycles if record.lap <= lap) for lap, _ in maps]
+        stamps = ([record.t for record in run.cycles if record.lap <= lap] for lap, _ in maps)
+        ends += [max(own, default=np.inf) for own in stamps]
     for index, (lap, track) in enumerate(maps):
         yield lap, track, ends[index], ends[index + 1]
 
@@ -402,19 +403,19 @@ def summarize(result: RunResult, log: Log | None, hints: Sequence[Hint] = ()) ->
         notes = noise_lines(scaled(result.noise, factor))
         summary |= {"notes": notes} if notes else {}
     if result.vehicle is not None:
-        named, found = result.vehicle.by_name, diagnose(scaled(result.vehicle, factor), result.settings)
+        named, told = result.vehicle.by_name, diagnose(scaled(result.vehicle, factor), result.settings)
         values = {name: value for name, (value, _) in named.items()}
         values |= {f"{name}_sigma": sigma for name, (_, sigma) in named.items()}
         summary |= {"calibration": values, "heading_sigma": float(result.vehicle.sigmas[2])}
-        summary |= {"diagnosis": found} if found else {}
+        summary |= {"diagnosis": told} if told else {}
     if log is not None and log.truth is not None:
         if has_cones(log.truth):
             summary["laps"] = [asdict(row) for row in laps_of(result, log)]
-            summary["final"] = asdict(_metrics(result.map, log.truth, result.laps, result.scale))
-            del summary["final"]["lap"]
-            of_one = scaled(log.truth, factor)
-            at_cones = accuracy.consistency_at_cones(result.at_scale_one().map, of_one)
-            summary["inside_two_sigma"] = at_cones["inside"]
+            track, of_one = result.at_scale_one().map, scaled(log.truth, factor)
+            found = accuracy.cone_errors(track, of_one)
+            final = {"rmse": found["rmse"] * result.scale, "missed": found["missed"], "size": track.size}
+            summary["final"] = final
+            summary["inside_two_sigma"] = accuracy.consistency_at_cones(track, of_one)["inside"]
         if len(log.truth.poses) and len(result.trajectory):
             errors = trajectory.trajectory_errors(result.trajectory_t, result.trajectory, log.truth)
             summary["ate"] = trajectory.position_rms(errors)
@@ -493,23 +494,13 @@ def lap_times(log: Log) -> Array:
 
 
 def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
-    """Return the paper's table: a row at the end of each true lap, or that of the end where there is none.
-
-    Without a true path the laps are the estimated ones; without true cones there is no row. The snapshots of
-    `result` are those at `lap_times`. A batch has one row.
-    """
+    """Return the paper's table: the laps of `measure`, else the last map as lap 0; empty without true cones."""
+    run, log = result.at_scale_one(), log.at_scale_one()
     if not has_cones(log.truth):
         return []
-    if isinstance(result, BatchRun):
-        return [_metrics(result.map, log.truth, result.laps, result.scale)]
-    by_truth = tuple(enumerate(result.snapshots, start=1))
-    maps = by_truth if len(log.truth.poses) else result.lap_maps
-    return [_metrics(track, log.truth, lap, result.scale) for lap, track in maps or ((0, result.map),)]
-
-
-def _metrics(track: Map, truth: Truth, lap: int, scale: float) -> LapMetrics:
-    found = accuracy.lap_metrics(scaled(track, 1.0 / scale), scaled(truth, 1.0 / scale), lap)
-    return replace(found, rmse=found.rmse * scale)
+    maps = [(lap, track) for lap, track, *_ in _laps(run, log)] or [(0, run.map)]
+    found = (accuracy.lap_metrics(track, log.truth, lap) for lap, track in maps)
+    return [replace(row, rmse=row.rmse * result.scale) for row in found]
 
 
 def not_mapped(track: Map, log: Log) -> list[str]:
