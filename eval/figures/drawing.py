@@ -17,7 +17,6 @@ from matplotlib.path import Path as Outline
 
 from pathspace_graph import labels as kinds
 from pathspace_graph.errors import SettingsError
-from pathspace_graph.eval.metrics.accuracy import mapped_points
 from pathspace_graph.eval.metrics.alignment import MapsApart
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import to_map
@@ -109,20 +108,13 @@ def uncertainty_band(boundary: SplineBoundary, u: Array, scale: float = 1.0) -> 
     return centre + offsets, centre - offsets
 
 
-def draw_curve(
-    axes: Axes,
-    spline: BSpline,
-    color: str,
-    label: str | None = None,
-    width: float = 0.7,
-    stretch: tuple[float, float] = (-np.inf, np.inf),
-    **line: Any,
-) -> None:
-    """Draw a spline over its whole domain, or over a stretch of it, from one parameter to another."""
-    u = curve_parameters(spline)
-    low, high = np.clip(stretch, u[0], u[-1])
-    points = spline.evaluate(np.concatenate([[low], u[(u > low) & (u < high)], [high]]))
-    axes.plot(*points.T, color=color, linewidth=width, label=label, **{"zorder": 3, **line})
+def curve_points(boundary: SplineBoundary, samples_per_span: int = 24) -> tuple[Array, Array]:
+    """Return points (k, 2) on the confirmed curve, and on its tentative end (j, 2), which may be none."""
+    u, until = curve_parameters(boundary.spline, samples_per_span), boundary.confirmed_until
+    shared = [until] if until < u[-1] else []
+    parts = np.append(u[u <= until], shared), np.append(shared, u[u > until])
+    confirmed, tentative = map(boundary.spline.evaluate, parts)
+    return confirmed, tentative
 
 
 def draw_points(
@@ -183,6 +175,7 @@ def save_figures(folder: Path, figures: Mapping[str, Figure]) -> None:
 BOUNDARY_COLORS: Final = {kinds.LEFT: BLUE, kinds.RIGHT: ORANGE}
 HEALTH_COLORS: Final = {DEGRADED: PURPLE, LOST: RED}
 LABEL_COLORS: Final = {**BOUNDARY_COLORS, kinds.UNKNOWN: GREY, **dict.fromkeys(kinds.POINTS, RED)}
+CURVE_WIDTH: Final = 0.7  # width of a curve (pt)
 PATH_WIDTH: Final = 0.6  # width of the trajectory (pt); the true path is thinner
 LANDMARK_SIZE: Final = 1.4  # size of landmarks (pt), small enough for their ellipses to be seen
 
@@ -254,11 +247,11 @@ def draw_boundary(axes: Axes, boundary: MapBoundary, label: int, band_scale: flo
             edges = Outline(left, closed=True), Outline(right[::-1], closed=True)
             outline = Outline.make_compound_path(*edges)
         axes.add_patch(PathPatch(outline, label=text, **area))
-    until = boundary.confirmed_until
-    draw_curve(axes, spline, color, f"{name} boundary", stretch=(-np.inf, until), zorder=4)
-    if until < spline.domain[1]:
-        dashed: dict[str, Any] = {"linestyle": (0, (4, 2)), "zorder": 4}
-        draw_curve(axes, spline, color, f"{name} tentative", stretch=(until, np.inf), **dashed)
+    confirmed, tentative = curve_points(boundary)
+    line: dict[str, Any] = {"color": color, "linewidth": CURVE_WIDTH, "zorder": 4}
+    axes.plot(*confirmed.T, label=f"{name} boundary", **line)
+    if len(tentative):
+        axes.plot(*tentative.T, label=f"{name} tentative", linestyle=(0, (4, 2)), **line)
     squares: dict[str, Any] = {"markerfacecolor": "white", "markeredgewidth": 0.6, "zorder": 5}
     points, text = spline.distinct_control_points, f"{name} control points"
     draw_points(axes, points, "s", color, text, **squares)
@@ -335,11 +328,11 @@ def plot_apart(first: Map, second: Map, apart: MapsApart, *, title: str | None =
         axes = figure.add_subplot(title=title or "")
         for track, color, name in ((first.moved(apart.motion), BLUE, "first"), (second, DARK, "second")):
             for boundary in track.boundaries.values():
-                points = mapped_points(boundary)
                 if isinstance(boundary, PointBoundary):
-                    draw_points(axes, points, "o", color, name, markersize=1.4, zorder=3)
+                    draw_points(axes, boundary.points, "o", color, name, markersize=1.4, zorder=3)
                 else:
-                    draw_curve(axes, boundary.spline, color, name, zorder=3)
+                    curve = boundary.spline.evaluate(curve_parameters(boundary.spline))
+                    axes.plot(*curve.T, color=color, linewidth=CURVE_WIDTH, label=name, zorder=3)
         points = np.concatenate([*apart.points.values()])
         distances = np.concatenate([*apart.distances.values()])
         order = np.argsort(distances)

@@ -494,7 +494,7 @@ def lap_times(log: Log) -> Array:
 
 
 def laps_of(result: RunResult, log: Log) -> list[LapMetrics]:
-    """Return the paper's table: the laps of `measure`, else the last map as lap 0; empty without true cones."""
+    """Return the paper's table for the laps of `measure`, else the last map as lap 0; empty without cones."""
     run, log = result.at_scale_one(), log.at_scale_one()
     if not has_cones(log.truth):
         return []

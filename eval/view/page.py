@@ -199,15 +199,13 @@ def _draw_boundary(drawn: figure, boundary: MapBoundary, name: str, color: str) 
         drawn.patches(*(list(ellipses[:, :, axis]) for axis in (0, 1)), legend_label=f"{name}, 2σ", **band)
         drawn.scatter(*boundary.points.T, size=4, color=color, legend_label=f"{name} landmarks", name=name)
         return
-    spline, until = boundary.spline, boundary.confirmed_until
-    u = drawing.curve_parameters(spline)
-    left, right = drawing.uncertainty_band(boundary, u)
+    spline, (known, rest) = boundary.spline, drawing.curve_points(boundary)
+    left, right = drawing.uncertainty_band(boundary, drawing.curve_parameters(spline))
     drawn.patch(*np.concatenate([left, right[::-1]]).T, legend_label=f"{name}, 2σ band", **band)
     look = {"color": color, "line_width": 1.5}
-    known = spline.evaluate(u[u <= until])
     drawn.line(*known.T, legend_label=f"{name}, 2σ band", name=name, **look)
-    if until < u[-1]:
-        rest, end = spline.evaluate(np.append(until, u[u > until])), f"{name} tentative"
+    if len(rest):
+        end = f"{name} tentative"
         drawn.line(*rest.T, line_dash="dashed", legend_label=end, name=end, **look)
     if len(boundary.cones):
         cones, end = spline.evaluate(boundary.cones[:, 0]), f"{name} cones"

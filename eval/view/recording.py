@@ -237,13 +237,10 @@ class Recorder:
             if isinstance(boundary, PointBoundary):
                 self._points(_path(label, "points"), boundary.points)
                 continue
-            u = drawing.curve_parameters(boundary.spline, 6)
-            until = boundary.confirmed_until
-            confirmed, tentative = u[u <= until], u[u > until]
-            if len(tentative):
-                confirmed, tentative = np.append(confirmed, until), np.append(until, tentative)
-            self._lines(_path(label, "curve"), [boundary.spline.evaluate(confirmed)])
-            self._lines(_path(label, "tentative"), dashes(boundary.spline.evaluate(tentative)))
+            confirmed, tentative = drawing.curve_points(boundary, 6)
+            self._lines(_path(label, "curve"), [confirmed])
+            dashes = [tentative[k : k + 2] for k in range(0, len(tentative) - 1, 2)]
+            self._lines(_path(label, "tentative"), dashes)
             self._points(_path(label, "points"), boundary.spline.distinct_control_points)
 
     def _show_messages(self, cycle: ObservedCycle) -> None:
@@ -264,11 +261,6 @@ class Recorder:
         for text, level in said:
             self._stream.log(MESSAGES, self._rerun.TextLog(text, level=level))
         self._last_health, self._closed = health, result.closed
-
-
-def dashes(points: Array) -> list[Array]:
-    """Return every other piece of the line through points (k, 2)."""
-    return [points[first : first + 2] for first in range(0, len(points) - 1, 2)]
 
 
 def _path(label: int, part: str) -> str:

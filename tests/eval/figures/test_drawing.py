@@ -95,6 +95,18 @@ def test_every_span_is_sampled_from_end_to_end() -> None:
     assert set(spline.breaks) <= set(u)
 
 
+def test_both_parts_of_a_curve_meet_where_it_is_confirmed_to() -> None:
+    x = np.linspace(0.0, 9.0, 12)
+    spline = BSpline.clamped_from(np.linspace(0.0, 9.0, 10), np.column_stack([x, 0.0 * x]))
+    boundary = SplineBoundary(spline, np.zeros((0, 0)), 4.05)
+    confirmed, tentative = drawing.curve_points(boundary, 2)
+    np.testing.assert_array_equal(confirmed[-1], spline.evaluate(np.array([4.05]))[0])
+    np.testing.assert_array_equal(confirmed[-1], tentative[0])
+    assert (np.diff(np.concatenate([confirmed, tentative[1:]])[:, 0]) > 0.0).all()
+    whole, nothing = drawing.curve_points(SplineBoundary(spline, np.zeros((0, 0))), 2)
+    assert len(whole) == len(confirmed) + len(tentative) - 2 and len(nothing) == 0
+
+
 def test_an_outline_of_an_ellipse_is_two_sigma_away_in_every_direction() -> None:
     points = np.array([[1.0, 2.0], [-3.0, 0.5]])
     covariance = np.array([[4.0, 1.0], [1.0, 2.0]])

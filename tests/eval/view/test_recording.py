@@ -16,7 +16,7 @@ from pathspace_graph.errors import OutputError, SettingsError
 from pathspace_graph.estimators import make_online
 from pathspace_graph.eval.view import recording as entities
 from pathspace_graph.eval.view import recording as module
-from pathspace_graph.eval.view.recording import BAND_EVERY, DISPLAYS, check_recording, dashes, recording
+from pathspace_graph.eval.view.recording import BAND_EVERY, DISPLAYS, check_recording, recording
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.log_files import write_log
 from pathspace_graph.labels import LEFT, RIGHT
@@ -118,6 +118,8 @@ def test_curves_are_there_in_every_cycle_and_bands_in_some(rows: Rows, run: Watc
         assert {len(edges) for edges in band.values()} == {2}
         tentative = of(rows, f"{entities.MAP}/{name}/tentative", "LineStrips2D:strips")
         assert any(tentative[cycle] for cycle in curve if cycle < closing)
+        dashes = [np.asarray(dash) for cycle in curve for dash in tentative[cycle]]
+        assert all(len(dash) == 2 for dash in dashes)
         assert not any(tentative[cycle] for cycle in curve if cycle >= closing)
         final = run.watched.map.boundaries[label].spline
         away = np.linalg.norm(final.foot_points(np.array(curve[last][0])).position - curve[last][0], axis=1)
@@ -179,14 +181,6 @@ def test_orange_cones_are_shown_in_every_cycle(corridor_log: Log, tmp_path: Any)
     shown = of(read(tmp_path / "a.rrd"), f"{entities.MAP}/orange/points", "Points2D:positions")
     assert set(range(len(corridor_log.cycles))) <= set(shown)
     np.testing.assert_allclose(shown[0], OrangeMapper.cones)
-
-
-def test_dashes_are_every_other_piece() -> None:
-    points = np.arange(10.0).reshape(5, 2)
-    first, second = dashes(points)
-    assert first.tolist() == [[0.0, 1.0], [2.0, 3.0]]
-    assert second.tolist() == [[4.0, 5.0], [6.0, 7.0]]
-    assert dashes(points[:1]) == dashes(points[:0]) == []
 
 
 @pytest.fixture
