@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from html import escape
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -33,57 +34,10 @@ OVER: Final[dict[str, Any]] = {  # of a figure over the time or along a boundary
     **{"min_border_left": 55, "toolbar_location": None},  # the axes below each other
 }
 
-PAGE: Final = Template("""{% extends base %}
-{% block postamble %}
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<style>
-body { font: 14px/1.4 sans-serif; margin: 8px auto; padding: 0 12px; max-width: 1500px; color: #222; }
-main { display: grid; grid-template: "map over" "told told" / minmax(0, 3fr) minmax(0, 2fr); gap: 0 24px; }
-@media (max-width: 900px) { main { grid-template: "map" "over" "told" / minmax(0, 1fr); } }
-h1 { font-size: 20px; margin: 4px 0; } h2 { font-size: 15px; margin: 12px 0 2px; }
-table { border-collapse: collapse; }
-td, th { text-align: left; padding: 1px 14px 1px 0; vertical-align: top; }
-.told { display: grid; grid-template-columns: repeat(auto-fit, minmax(340px, 1fr)); gap: 0 24px; }
-</style>
-{% endblock %}
-{% block contents %}
-<h1>{{ title }}</h1>
-<main>
-<div style="grid-area: map">{{ embed(roots.slider) }}{{ embed(roots.readout) }}{{ embed(roots.map) }}</div>
-<div style="grid-area: over">
-{% for root in roots if root.name.startswith("over") %}{{ embed(root) }}{% endfor %}
-</div>
-<div style="grid-area: told" class="told">
-{% for name, part in sections.items() %}<section><h2>{{ name }}</h2>{{ part }}</section>{% endfor %}
-</div>
-</main>
-{% endblock %}
-""")
-"""The page around the figures: side by side, or below each other on a narrow screen."""
-
-MOVE: Final = """
-const c = cycles.data, k = slider.value, cos = Math.cos(c.theta[k]), sin = Math.sin(c.theta[k])
-vehicle.data = {
-    x: ahead.map((a, i) => c.x[k] + cos * a - sin * left[i]),
-    y: ahead.map((a, i) => c.y[k] + sin * a + cos * left[i]),
-}
-const begin = c.since.findIndex(one => one > c.since[k] - trail)
-driven.data = {x: c.x.slice(begin, k + 1), y: c.y.slice(begin, k + 1)}
-for (const cursor of cursors) { cursor.location = c.since[k] }
-const heading = (Math.atan2(sin, cos) * 180 / Math.PI).toFixed(1)
-const pose = `x ${c.x[k].toFixed(2)} m, y ${c.y[k].toFixed(2)} m, heading ${heading}°`
-const told = [c.health[k], c.reason[k]].filter(Boolean).join(": ")
-readout.text = `<b>${c.since[k].toFixed(1)} s</b>, lap ${c.lap[k]}, cycle ${k}: ${pose}<br>`
-    + `${c.readings[k]} of ${c.offered[k]} detections used` + (told && `; ${told.replace(/</g, "&lt;")}`)
-"""
-"""Place the vehicle at the slider's cycle, in JavaScript."""
-
-PICK: Final = """
-const t = cycles.data.since
-let k = t.findIndex(one => one >= cb_obj.x)
-slider.value = k < 0 ? t.length - 1 : k
-"""
-"""Move the slider to the time that was clicked."""
+PAGE, MOVE, PICK = (
+    Path(__file__).with_name(name).read_text(encoding="utf-8") for name in ("page.html", "move.js", "pick.js")
+)
+"""The page around the figures, and scripts that place the vehicle and pick a cycle."""
 
 
 def page(
@@ -146,7 +100,9 @@ def page(
     for root in (slider, readout, drawn, *over):
         document.add_root(root)
     variables = {"sections": {escape(name): part for name, part in told.items()}}
-    return str(file_html(document, INLINE, escape(title), template=PAGE, template_variables=variables))
+    return str(
+        file_html(document, INLINE, escape(title), template=Template(PAGE), template_variables=variables)
+    )
 
 
 def _map_figure(
@@ -199,7 +155,7 @@ def _draw_boundary(drawn: figure, boundary: MapBoundary, name: str, color: str) 
         drawn.patches(*(list(ellipses[:, :, axis]) for axis in (0, 1)), legend_label=f"{name}, 2σ", **band)
         drawn.scatter(*boundary.points.T, size=4, color=color, legend_label=f"{name} landmarks", name=name)
         return
-    spline, (known, rest) = boundary.spline, drawing.curve_points(boundary)
+    spline, (known, rest) = boundary.spline, drawing.curve_parts(boundary)
     left, right = drawing.uncertainty_band(boundary, drawing.curve_parameters(spline))
     drawn.patch(*np.concatenate([left, right[::-1]]).T, legend_label=f"{name}, 2σ band", **band)
     look = {"color": color, "line_width": 1.5}

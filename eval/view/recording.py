@@ -237,7 +237,7 @@ class Recorder:
             if isinstance(boundary, PointBoundary):
                 self._points(_path(label, "points"), boundary.points)
                 continue
-            confirmed, tentative = drawing.curve_points(boundary, 6)
+            confirmed, tentative = drawing.curve_parts(boundary, 6)
             self._lines(_path(label, "curve"), [confirmed])
             dashes = [tentative[k : k + 2] for k in range(0, len(tentative) - 1, 2)]
             self._lines(_path(label, "tentative"), dashes)
