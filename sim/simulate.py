@@ -171,13 +171,9 @@ def _as_recorded(log: Log, settings: SimulationSettings) -> Log:
     sensor = settings.sensor
     sigmas = [sensor.range_sigma * settings.scale, sensor.range_sigma_growth, sensor.bearing_sigma]
     truth = log.truth and replace(log.truth, rays=np.array(sigmas))
-    cycles = (
-        replace(cycle, covariances=logs.ray_covariances(cycle.points_vehicle, logs.SIGMA_DETECTIONS))
-        for cycle in log.cycles
-    )
+    assumed = log.with_covariances(lambda points: logs.ray_covariances(points, logs.SIGMA_DETECTIONS))
     return replace(
-        log,
-        cycles=tuple(cycles),
+        assumed,
         odometry_sigma=np.array(logs.SIGMA_ODOMETRY),
         sensor=SensorInfo(kind=log.sensor.kind),
         source={**log.source, "draw": "True"},

@@ -21,7 +21,7 @@ from pathspace_graph.eval.metrics.alignment import MapsApart
 from pathspace_graph.factors.arrays import Array
 from pathspace_graph.factors.se2 import to_map
 from pathspace_graph.health import DEGRADED, LOST
-from pathspace_graph.io.files import atomic_file, is_stream
+from pathspace_graph.io.files import atomic_file, check_file_target, is_stream
 from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.map import Map, MapBoundary, PointBoundary, SplineBoundary
 from pathspace_graph.labels import BOUNDARIES, NAMES
@@ -108,7 +108,7 @@ def uncertainty_band(boundary: SplineBoundary, u: Array, scale: float = 1.0) -> 
     return centre + offsets, centre - offsets
 
 
-def curve_points(boundary: SplineBoundary, samples_per_span: int = 24) -> tuple[Array, Array]:
+def curve_parts(boundary: SplineBoundary, samples_per_span: int = 24) -> tuple[Array, Array]:
     """Return points (k, 2) on the confirmed curve, and on its tentative end (j, 2), which may be none."""
     u, until = curve_parameters(boundary.spline, samples_per_span), boundary.confirmed_until
     shared = [until] if until < u[-1] else []
@@ -143,7 +143,8 @@ def ellipse_outlines(points: Array, joint: Array, scale: float = 1.0) -> Array:
 
 
 def check_plot_file(file: Path | str) -> str:
-    """Return the suffix of `file`, or .png for a stream; raise SettingsError where it is no picture's."""
+    """Return the suffix of `file`, or .png for a stream; raise an error where no picture can be written."""
+    check_file_target(file)
     suffix = Path(file).suffix.lower()
     if suffix not in FORMATS and is_stream(Path(file)):
         return FORMATS[0]
@@ -247,7 +248,7 @@ def draw_boundary(axes: Axes, boundary: MapBoundary, label: int, band_scale: flo
             edges = Outline(left, closed=True), Outline(right[::-1], closed=True)
             outline = Outline.make_compound_path(*edges)
         axes.add_patch(PathPatch(outline, label=text, **area))
-    confirmed, tentative = curve_points(boundary)
+    confirmed, tentative = curve_parts(boundary)
     line: dict[str, Any] = {"color": color, "linewidth": CURVE_WIDTH, "zorder": 4}
     axes.plot(*confirmed.T, label=f"{name} boundary", **line)
     if len(tentative):

@@ -66,10 +66,8 @@ def with_true_covariances(log: Log) -> Log:
     rays = truth_of(log).rays
     if rays is None:
         return log
-    cycles = tuple(
-        replace(cycle, covariances=ray_covariances(cycle.points_vehicle, rays)) for cycle in log.cycles
-    )
-    return replace(log, cycles=cycles, odometry_stated=True, detections_stated=True)
+    log = log.with_covariances(lambda points: ray_covariances(points, rays))
+    return replace(log, odometry_stated=True, detections_stated=True)
 
 
 def with_true_noise(log: Log, associations: IntArray) -> Log:

@@ -195,7 +195,7 @@ class CkfMapper(_Filter):
             simplify(state, self.expansion.observed)
             self.closed = True
 
-    def _map(self, with_covariance: bool) -> Map:
+    def map(self, with_covariance: bool = True) -> Map:
         state, curves = self.state, {}
         for label in state.curves:
             covariance = state.covariance(label) if with_covariance else NO_COVARIANCE
@@ -335,6 +335,6 @@ class LandmarkCkf(_Filter):
             self.belief.add_points(detections.points_vehicle[rows], detections.covariances[rows])
             self.labels = np.concatenate([self.labels, detections.labels[rows]])
 
-    def _map(self, with_covariance: bool) -> Map:
+    def map(self, with_covariance: bool = True) -> Map:
         joint = self.belief.covariance[HEAD:, HEAD:] if with_covariance else None
         return landmarks.point_map(self.belief.points, self.labels, joint, False)

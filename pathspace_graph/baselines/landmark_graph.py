@@ -207,7 +207,7 @@ class LandmarkFixedLag(landmarks.OnlineBaseline):
             np.maximum.at(self._last_detected, numbers[kept], self._last_detected[numbers[gone]])
             landmarks.merge(self.smoother, gone, kept)
 
-    def _map(self, with_covariance: bool) -> Map:
+    def map(self, with_covariance: bool = True) -> Map:
         state = self.smoother.map.state
         if with_covariance and len(state):
             joint = self.smoother.last_covariance(state.keys)

@@ -526,14 +526,11 @@ class OnlineBaseline:
         """Map a cycle."""
 
     @abstractmethod
-    def _map(self, with_covariance: bool) -> Map:
+    def map(self, with_covariance: bool = True) -> Map:
         """Return a copy of the map."""
 
-    def map(self) -> Map:
-        return self._map(True)
-
     def outline(self) -> Map:
-        return self._map(False)
+        return self.map(with_covariance=False)
 
     def noise_used(self) -> RunNoise:
         return self.front_end.noise_used

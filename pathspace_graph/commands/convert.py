@@ -1,6 +1,7 @@
 """`convert`: a ROS bag, CSV files or JSON lines as a log."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -137,7 +138,4 @@ def with_measured_noise(log: Log, parts: int = 1) -> Log:
         log = replace(log, odometry_sigma=sigma, odometry_drift=measured.drift)
     if log.detections_stated:
         return log
-    known = ((cycle, measured.covariances(cycle.points_vehicle, inflated=False)) for cycle in log.cycles)
-    return replace(
-        log, cycles=tuple(cycle if K is None else replace(cycle, covariances=K) for cycle, K in known)
-    )
+    return log.with_covariances(partial(measured.covariances, inflated=False))

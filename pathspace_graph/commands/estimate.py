@@ -82,7 +82,7 @@ def online_command(options: Online) -> Outcome:
     drawing = viewing = None
     if options.plot is not None:  # importing matplotlib is slow
         drawing = import_module("pathspace_graph.commands.pictures")
-        drawing.check_picture(options.plot)
+        drawing.check_plot_file(options.plot)
     if options.view or options.save_view is not None:
         viewing = import_module("pathspace_graph.eval.view.recording")
         viewing.check_recording(options.save_view, options.view)

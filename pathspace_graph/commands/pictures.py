@@ -1,7 +1,6 @@
 """`plot` and `view`: a map as a picture, and a result as one page for any browser."""
 
 from importlib import import_module
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -24,7 +23,7 @@ SUMMARY_FILE: Final = "summary.json"
 
 
 def plot_command(options: Plot) -> Outcome:
-    check_picture(options.out)
+    check_plot_file(options.out)
     track = read_map(options.map)
     log = None if options.log is None else read_log(options.log)
     files = (options.map / name for name in (TRAJECTORY_FILE, SMOOTHED_FILE))
@@ -37,12 +36,6 @@ def plot_command(options: Plot) -> Outcome:
     look["differences"] = [(one["x"], one["y"]) for one in differences]  # from the map that was known
     save_plot(plot_map(track, log=log, **look), options.out)
     return Outcome([options.out])
-
-
-def check_picture(file: Path) -> None:
-    """Raise an error where no picture could be written, before anything is mapped."""
-    check_plot_file(file)
-    check_file_target(file)
 
 
 # --- `view`: a result as one page for any browser -------------------------------------------------------

@@ -8,8 +8,6 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 from joblib import Parallel, delayed
-from rich.table import Table
-from rich.text import Text
 
 from pathspace_graph.console import LINES, note, output, progress, say
 from pathspace_graph.errors import SettingsError
@@ -20,10 +18,10 @@ from pathspace_graph.eval.experiment import compare as experiment
 from pathspace_graph.eval.experiment import run as runs
 from pathspace_graph.eval.experiment.faults import at_strength, only, suite, write_suite
 from pathspace_graph.eval.experiment.study import Study, find_study, log_folders, read_study_file
-from pathspace_graph.eval.experiment.tables import write_study
+from pathspace_graph.eval.experiment.tables import TextTable, write_study
 from pathspace_graph.eval.figures.drawing import plot_apart, plot_map, save_plot
 from pathspace_graph.eval.metrics.alignment import maps_apart
-from pathspace_graph.eval.metrics.measures import laps_of, not_mapped, summarize
+from pathspace_graph.eval.metrics.measures import figures, laps_of, not_mapped, summarize
 from pathspace_graph.eval.report import ReportPlan, write_report
 from pathspace_graph.io.files import atomic_folder, check_target, write_json
 from pathspace_graph.io.log_files import write_log
@@ -106,7 +104,6 @@ def report_command(options: Report) -> Outcome:
 
 PICTURE: Final = "track.png"
 APART_FILE: Final = "apart.json"  # by which the folder is recognized
-STATISTICS: Final = ("mean", "rms", "p95", "max")
 
 
 def compare_command(options: Compare) -> Outcome:
@@ -146,13 +143,8 @@ def compare_maps(first: Path, second: Path, out: Path, *, force: bool) -> Outcom
     with atomic_folder(out, APART_FILE, force=force) as folder:
         write_json(folder / APART_FILE, content)
         save_plot(plot_apart(*tracks, apart), folder / "apart.png")
-    table = Table()
-    table.add_column("boundary")
-    for name in STATISTICS:
-        table.add_column(Text(f"{name} [m]"), justify="right")  # a plain text would be markup
-    for name, own in apart.statistics().items():
-        table.add_row(name, *(f"{own[key]:.3f}" for key in STATISTICS))
-    output().print(table)
+    rows = [(name, *figures(own.values(), 3)) for name, own in apart.statistics().items()]
+    output().print(TextTable.of(("boundary", "mean [m]", "rms [m]", "p95 [m]", "max [m]"), rows).rich())
     x, y, turn = apart.motion.tolist()
     where = f"({x:.3f}, {y:.3f}) m, turned by {np.rad2deg(turn):.3f}°"
     say(f"the frame of {first} is at {where} in that of {second}")

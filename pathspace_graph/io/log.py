@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
@@ -253,6 +253,12 @@ class Log(Shown):
             detections_stated=m is not None,
             odometry_drift=None if odometry_drift is None else np.array(odometry_drift, float),
         )
+
+    def with_covariances(self, of: Callable[[Array], Array | None]) -> Log:
+        """Replace covariances by those `of` points (m, 2), except of cycles for which there are none."""
+        known = ((cycle, of(cycle.points_vehicle)) for cycle in self.cycles)
+        cycles = (cycle if K is None else replace(cycle, covariances=K) for cycle, K in known)
+        return replace(self, cycles=tuple(cycles))
 
     def at_scale_one(self) -> Log:
         """Divide all lengths by the scale of the scene."""

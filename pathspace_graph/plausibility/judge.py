@@ -6,7 +6,7 @@ The texts of the hints are a table, `hints.csv`.
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import chain
 from math import hypot
 from pathlib import Path
@@ -173,8 +173,7 @@ def with_usual_noise(log: Log) -> Log:
         for one, most in ((noise.along, (0.2, 0.1)), (noise.across, (0.2, 0.05)))  # at 0 m and per m
     )
     usual = replace(noise, along=along, across=across)
-    known = ((cycle, usual.covariances(cycle.points_vehicle, inflated=False)) for cycle in log.cycles)
-    return replace(log, cycles=tuple(replace(cycle, covariances=C) for cycle, C in known if C is not None))
+    return log.with_covariances(partial(usual.covariances, inflated=False))
 
 
 def gaps_and_reach(log: Log) -> list[Hint]:

@@ -99,11 +99,11 @@ def test_both_parts_of_a_curve_meet_where_it_is_confirmed_to() -> None:
     x = np.linspace(0.0, 9.0, 12)
     spline = BSpline.clamped_from(np.linspace(0.0, 9.0, 10), np.column_stack([x, 0.0 * x]))
     boundary = SplineBoundary(spline, np.zeros((0, 0)), 4.05)
-    confirmed, tentative = drawing.curve_points(boundary, 2)
+    confirmed, tentative = drawing.curve_parts(boundary, 2)
     np.testing.assert_array_equal(confirmed[-1], spline.evaluate(np.array([4.05]))[0])
     np.testing.assert_array_equal(confirmed[-1], tentative[0])
     assert (np.diff(np.concatenate([confirmed, tentative[1:]])[:, 0]) > 0.0).all()
-    whole, nothing = drawing.curve_points(SplineBoundary(spline, np.zeros((0, 0))), 2)
+    whole, nothing = drawing.curve_parts(SplineBoundary(spline, np.zeros((0, 0))), 2)
     assert len(whole) == len(confirmed) + len(tentative) - 2 and len(nothing) == 0
 
 
