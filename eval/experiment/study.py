@@ -76,11 +76,12 @@ def simulated_drive(track: Track, seed: int, noise: str, simulation: SimulationS
     digest = track_digest(track)
     own = int(identity(track=digest, seed=seed)[:8], 16)
     meaning = identity(track=digest, seed=own, simulation=asdict(simulation))
-    return StudyDrive(
-        *(track.name, seed, noise, str(own), meaning),
-        lambda: (simulate(track, simulation, own), ()),
-        simulation,
-    )
+    read = partial(_simulated, track, simulation, own)
+    return StudyDrive(track.name, seed, noise, str(own), meaning, read, simulation)
+
+
+def _simulated(track: Track, simulation: SimulationSettings, seed: int) -> tuple[Log, Sequence[Hint]]:
+    return simulate(track, simulation, seed), ()
 
 
 def recorded_drive(track: str, number: int, folder: Path, limits: LimitSettings) -> StudyDrive:
