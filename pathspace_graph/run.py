@@ -210,10 +210,10 @@ def split_odometry(log: Log) -> Iterator[tuple[Odometry, Detections]]:
         since = detections.t
 
 
-def timed_wait(estimator: OnlineEstimator) -> float:
-    """Wait for a batch whose result the next update may use; return the wall time (s)."""
+def timed_wait(estimator: OnlineEstimator, method: str = "wait") -> float:
+    """Wait for a batch whose result the next update may use, or `finish`; return the wall time (s)."""
     begin = time.perf_counter()
-    _ask(estimator, "wait")
+    _ask(estimator, method)
     return time.perf_counter() - begin
 
 
@@ -307,9 +307,7 @@ def run_online(
                 observer(cycle)
             observing += time.perf_counter() - begin if observers else 0.0
         snapshots += [map_of(estimator) for _ in upcoming]
-        begin = time.perf_counter()
-        _ask(estimator, "finish")
-        waited += time.perf_counter() - begin
+        waited += timed_wait(estimator, "finish")
         track, t = estimator.map(), np.array([record.t for record in records])
         if laps.last_lap_is_complete:
             lap_maps.append((laps.lap, track))

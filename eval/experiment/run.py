@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
 from functools import cache, cached_property, partial
 from hashlib import sha256
 from importlib.machinery import EXTENSION_SUFFIXES, ModuleSpec
@@ -38,7 +39,7 @@ from pathspace_graph.io.files import atomic_folder, check_target, to_plain, writ
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.map import MAP_FILE, Map, read_map
 from pathspace_graph.io.parsing import read_json, shown
-from pathspace_graph.io.results import RunResult, commit_of, machine, now, write_result
+from pathspace_graph.io.results import RunResult, commit_of, machine, write_result
 from pathspace_graph.lengths import times
 from pathspace_graph.loop.lap_solver import end_with
 from pathspace_graph.plausibility.diagnosis import diagnose
@@ -174,7 +175,7 @@ def origin_of(module: str) -> dict[str, Any]:
         **versions(),
         "commit": " ".join(commits.values() if len(packages) == 1 else map(" ".join, commits.items())),
         **machine(),
-        "date": now(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
 
@@ -394,8 +395,6 @@ class EstimatorCell(Cell):
 
     drive: StudyDrive
     estimator: str
-    variant: str
-    """Name of the settings."""
     settings: MapperSettings
     parameters: Any
     """Own ones of the estimator, a frozen dataclass; None where it has none."""
@@ -523,7 +522,6 @@ def make_plan(study: Study, *, keep: bool = False) -> Plan:
             keep=keep,
             drive=drive,
             estimator=estimator,
-            variant=name,
             settings=settings,
             parameters=parameters,
         )

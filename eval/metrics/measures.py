@@ -390,12 +390,23 @@ def summarize(result: RunResult, log: Log | None, hints: Sequence[Hint] = ()) ->
             "dropped": sum(record.dropped for record in result.cycles),
             "refused": sum(record.refused for record in result.cycles),
         },
-        **_cycles(result),
+        "seconds": None,
     }
+    if seconds := [record.seconds for record in result.cycles]:
+        p99 = float(np.quantile(seconds, 0.99))
+        summary["seconds"] = {"mean": float(np.mean(seconds)), "p99": p99, "max": max(seconds)}
+    if result.batches is not None:
+        summary["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
+    if told := [record for record in result.cycles if record.jump is not None or record.notice]:
+        keys = ("cycle", "t", "jump", "notice")
+        summary["events"] = [{key: getattr(record, key) for key in keys} for record in told]
+    if any(record.health for record in result.cycles):
+        number = counts([health_of(record) for record in result.cycles])
+        summary["health"] = {**number, "stretches": [asdict(of) for of in stretches_of(result)]}
     if crossed := crossings_of(result):
         places = [(NAMES[one.label], *one.place.tolist(), one.driven) for one in crossed]
-        keys = ("boundary", "x", "y", "driven")
-        summary["crossings"] = [dict(zip(keys, place, strict=True)) for place in places]
+        names = ("boundary", "x", "y", "driven")
+        summary["crossings"] = [dict(zip(names, place, strict=True)) for place in places]
     if hints:
         summary["hints"] = [vars(hint) for hint in hints]
     if result.noise is not None:
@@ -403,11 +414,11 @@ def summarize(result: RunResult, log: Log | None, hints: Sequence[Hint] = ()) ->
         notes = noise_lines(scaled(result.noise, factor))
         summary |= {"notes": notes} if notes else {}
     if result.vehicle is not None:
-        named, told = result.vehicle.by_name, diagnose(scaled(result.vehicle, factor), result.settings)
+        named, lines = result.vehicle.by_name, diagnose(scaled(result.vehicle, factor), result.settings)
         values = {name: value for name, (value, _) in named.items()}
         values |= {f"{name}_sigma": sigma for name, (_, sigma) in named.items()}
         summary |= {"calibration": values, "heading_sigma": float(result.vehicle.sigmas[2])}
-        summary |= {"diagnosis": told} if told else {}
+        summary |= {"diagnosis": lines} if lines else {}
     if log is not None and log.truth is not None:
         if has_cones(log.truth):
             summary["laps"] = [asdict(row) for row in laps_of(result, log)]
@@ -419,28 +430,9 @@ def summarize(result: RunResult, log: Log | None, hints: Sequence[Hint] = ()) ->
         if len(log.truth.poses) and len(result.trajectory):
             errors = trajectory.trajectory_errors(result.trajectory_t, result.trajectory, log.truth)
             summary["ate"] = trajectory.position_rms(errors)
-            names = ("rmse_along", "rmse_across", "rmse_heading")  # m, m, rad
-            summary |= dict(zip(names, map(accuracy.root_mean_square, errors.T), strict=True))
+            parts = ("rmse_along", "rmse_across", "rmse_heading")  # m, m, rad
+            summary |= dict(zip(parts, map(accuracy.root_mean_square, errors.T), strict=True))
     return summary
-
-
-def _cycles(result: RunResult) -> dict[str, Any]:
-    """Times of the updates, batches, notices and health of a run."""
-    seconds = [record.seconds for record in result.cycles]
-    found: dict[str, Any] = {"seconds": None}
-    if seconds:
-        p99 = float(np.quantile(seconds, 0.99))
-        found["seconds"] = {"mean": float(np.mean(seconds)), "p99": p99, "max": max(seconds)}
-    if result.batches is not None:
-        found["batches"] = {**asdict(result.batches), "waited_seconds": result.waited}
-    told = [record for record in result.cycles if record.jump is not None or record.notice]
-    if told:
-        keys = ("cycle", "t", "jump", "notice")
-        found["events"] = [{key: getattr(record, key) for key in keys} for record in told]
-    if any(record.health for record in result.cycles):
-        number = counts([health_of(record) for record in result.cycles])
-        found["health"] = {**number, "stretches": [asdict(of) for of in stretches_of(result)]}
-    return found
 
 
 def _noise(noise: RunNoise, log: Log | None) -> dict[str, Any]:

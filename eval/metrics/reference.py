@@ -89,7 +89,7 @@ def with_true_noise(log: Log, associations: IntArray) -> Log:
     cycles, row = [], 0
     for cycle in log.cycles:
         size = len(cycle.labels)
-        _, radial = _rays(cycle.points_vehicle)
+        radial = _rays(cycle.points_vehicle)[1]
         along, across = np.sqrt(factors[row : row + size]).T[:, :, None, None]
         change = along * radial + across * (np.eye(2) - radial)
         cycles.append(replace(cycle, covariances=change @ cycle.covariances @ change))

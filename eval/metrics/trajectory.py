@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from pathspace_graph.factors.arrays import Array
-from pathspace_graph.factors.se2 import path_lengths, to_map, to_vehicle, wrap_angle
+from pathspace_graph.factors.se2 import path_lengths, relative, to_map, to_vehicle, wrap_angle
 from pathspace_graph.io.log import Truth
 from pathspace_graph.io.map import Map, SplineBoundary
 from pathspace_graph.io.results import VehicleState
@@ -34,9 +34,8 @@ def trajectory_errors(t: Array, poses: Array, truth: Truth) -> Array:
     """
     inside = (t >= truth.pose_t[0]) & (t <= truth.pose_t[-1])
     expected = interpolate_poses(truth.pose_t, truth.poses, t[inside])
-    dx, dy, turn = (poses[inside] - expected).T
-    c, s = np.cos(expected[:, 2]), np.sin(expected[:, 2])
-    return np.stack([c * dx + s * dy, c * dy - s * dx, wrap_angle(turn)], axis=1)
+    errors = relative(expected, poses[inside])
+    return np.column_stack([errors[:, :2], wrap_angle(errors[:, 2])])
 
 
 def end_of_trajectory(t: Array, poses: Array, truth: Truth) -> dict[str, float]:

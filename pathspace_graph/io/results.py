@@ -291,11 +291,8 @@ def made() -> dict[str, str]:
     commit = "" if installed else commit_of(folder)
     parts = (named["host"], named["processor"], named["blas"])
     commit = commit or f"version {version('pathspace-graph')}"
-    return {"commit": commit, "machine": ", ".join(filter(None, parts)), "date": now()}
-
-
-def now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"commit": commit, "machine": ", ".join(filter(None, parts)), "date": date}
 
 
 @cache

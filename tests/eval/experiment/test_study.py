@@ -249,7 +249,7 @@ def test_cells_share_a_drive_and_have_an_identity_each() -> None:
 def test_a_cell_is_known_by_what_it_runs_not_by_what_it_is_called() -> None:
     grid = make_plan(Study(tracks=(0,), grids=({"lag": [1.0]},))).cells[1]
     named = make_plan(Study(tracks=(0,), variants={"short": {"lag": 1.0}})).cells[1]
-    assert grid.variant != named.variant
+    assert grid.names["variant"] != named.names["variant"]
     assert grid.id == named.id
     longer = make_plan(Study(tracks=(0,), laps=6)).cells[0]
     assert longer.id != make_plan(Study(tracks=(0,))).cells[0].id
