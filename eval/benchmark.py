@@ -58,8 +58,8 @@ from pathspace_graph.run import (
     timed_wait,
 )
 from pathspace_graph.settings.mapper import CONES_MIN, MapperSettings, ScalingSettings
-from pathspace_graph.sim.sensor import LINE, LineSettings, SensorSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.sensor import LineSettings, SensorSettings
+from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track import Track, along_polyline, arc_lengths, unit
 from pathspace_graph.sim.track_generator import generate_track
 from pathspace_graph.sim.vehicle import VehicleSettings
@@ -464,8 +464,9 @@ def sweep_drives(sweep: str, settings: ScalingSettings) -> list[tuple[Log, Array
         log = fast_drive(closed, settings.laps)
         lap = 1.0 + np.searchsorted(lap_times(log), [seen.t for seen in log.cycles])
         return [(log, np.where(lap <= settings.laps, lap, np.nan))]
+    points = preset({"sensor": "line"}).sensor
     # a spacing (m) that gives so many points
-    log = fast_drive(closed, 2, sensor=replace(LINE, range_max=DENSE_RANGE), line=LineSettings(0.2))
+    log = fast_drive(closed, 2, sensor=replace(points, range_max=DENSE_RANGE), line=LineSettings(0.2))
     return [(log, np.full(len(log.cycles), float(LINE_POINTS)))]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import scipy  # which imports its modules when they are used
@@ -253,16 +253,6 @@ class LineSettings(Checked, group="line"):
     """Standard deviation of a point across its boundary beside the noise of range and bearing (m)."""
     gaps: Annotated[int, Meta(ge=0, description="a whole number of at least 0")] = 0
     """Number of stretches of 10 m of a boundary in which nothing is detected, drawn once for a log."""
-
-
-LINE: Final = SensorSettings(
-    detection_probability=1.0,
-    detection_falloff=0.0,
-    blind_fraction=0.0,
-    wrong_colour=0.0,
-    false_positives=0.3,
-)
-"""Range, field and noise of the plain sensor; 1 % of the points are clutter where they are 1 m apart."""
 
 
 def curve_through(points: Array, closed: bool) -> SmoothCurve:

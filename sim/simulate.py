@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from math import radians
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -14,67 +15,15 @@ from pathspace_graph.factors.arrays import Array, IntArray
 from pathspace_graph.factors.sensor import SENSOR
 from pathspace_graph.io import log as logs
 from pathspace_graph.io.log import Detections, Log, SensorInfo, Truth
+from pathspace_graph.io.parsing import parse_toml, read_text
 from pathspace_graph.labels import BOUNDARIES, LEFT, NAMES, RIGHT, UNKNOWN
 from pathspace_graph.lengths import scaled
-from pathspace_graph.settings.checked import Checked, leaves
+from pathspace_graph.settings.checked import Checked, flatten, leaves, override
 
 from .faults import Faults, OdometryFaults, SensorFaults, measure_odometry, put_down, time_at, turned_round
-from .sensor import LINE, ConeSensor, LineSensor, LineSettings, OdometryNoise, SensorSettings, as_lines
+from .sensor import ConeSensor, LineSensor, LineSettings, OdometryNoise, SensorSettings, as_lines
 from .track import Track, to_map_frame
 from .vehicle import Trajectory, VehicleSettings, displacements, drive
-
-# --- cameras and odometry that recordings show ------------------------------------------------------------
-
-CAMERA: Final = SensorSettings(
-    rate=5.0,
-    range_max=40.0,
-    fov=radians(130.0),
-    range_sigma=0.03,
-    range_sigma_growth=0.05,
-    bearing_sigma=0.0125,
-    detection_probability=1.0,
-    detection_falloff=0.022,
-    blind_fraction=0.0,
-    wrong_colour=0.001,
-    false_positives=0.05,
-    slow_range=0.08,
-    slow_bearing=0.8,
-    slow_time=8.0,
-    duplicates=0.9,
-    overlap=(radians(5.0), radians(17.0)),
-    dropped_cycles=0.005,
-    sigma_range_scale=0.0,
-)
-"""Three cameras of a Formula Student car, as its recordings of three laps show them.
-
-Their fields span bearings of +-65 degrees. A smoothed map gave the errors of some 900 passes of cones. Those
-along the ray grow to 0.5 m at 10 m and 1.2 m at 22 m, with hardly any correlation from cycle to cycle. Those
-across are 0.007 rad about their mean over a pass, but 0.011 to 0.015 rad between two cameras that see the
-same cone: most of the error stays with the cone. The correlation time gave these figures and those of lag 1
-to 5 again in a simulated log. Of the cones in the overlaps, at bearings of 5 to 17 degrees on both sides, 75
-to 100 % are seen twice. 0.5 % of the cycles are missing. A cone is detected with a probability of 0.97 below
-6 m, 0.8 at 14 m, 0.5 at 22 m and 0.15 at 37 m. Of the detections within 12 m, 0.1 % have the other
-boundary's colour and about 0.04 a cycle are of no cone.
-"""
-CAMERA_FAULTS: Final = SensorFaults(
-    latency=-0.12, yaw=-0.0175, range_scale=0.08, range_bias=-0.19, colourless=0.01
-)
-"""Constant errors of these cameras against the odometry, which differ a little from lap to lap.
-
-Fits on each lap gave stamps 0.108 to 0.131 s early, a yaw of 0.6 to 1.4 degrees to the right, and ranges
-0.19 m too short and 7 to 9 % too long.
-"""
-INS: Final = OdometryNoise(
-    white=(0.009, 0.003, 0.003), gyro_bias=0.0002, slow=(0.03, 0.03, 0.0005), slow_time=5.0
-)
-"""Inertial navigation of the same car.
-
-Third differences of the readings gave the white noise. The slow errors and the bias are such that a lap of
-240 m in 90 s ends 1 m and 0.02 rad off by dead reckoning: the three laps ended 0.8, 0.8 and 1.9 m, and 0.01
-to 0.03 rad off. The correlation time is assumed.
-"""
-INS_RATE: Final = 40.0  # rate of the INS (Hz)
-
 
 # --- a drive -----------------------------------------------------------------------------------------------
 
@@ -99,17 +48,13 @@ class SimulationSettings(Checked, group=""):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        overrun = self.vehicle.overrun
-        drawn = {  # groups that are drawn, each with its default and its presets
-            "sensor": (SensorSettings(), CAMERA, LINE),
-            "odometry": (OdometryNoise(), INS),
-            "vehicle": (VehicleSettings(overrun=overrun), VehicleSettings(overrun=overrun, rate=INS_RATE)),
-            "faults.sensor": (SensorFaults(), CAMERA_FAULTS),
-            "faults.odometry": (OdometryFaults(),),
-        }
-        for group, values in drawn.items() if self.draw else ():
-            if attrgetter(group)(self) not in values:
-                raise SettingsError(f"draw: expected no setting of {group} beside it, since it is drawn")
+        if self.draw:
+            usual = replace(self.vehicle, overrun=VehicleSettings().overrun)
+            own = replace(self, draw=False, vehicle=usual)
+            known = [preset({group: name}) for group, named in PRESETS.items() for name in named]
+            for name, group in ((name, attrgetter(name)) for name in DRAWN):
+                if group(own) not in map(group, known):
+                    raise SettingsError(f"draw: expected no setting of {name} beside it, since it is drawn")
         if self.faults.odometry.false_travel and not self.vehicle.stand:
             raise SettingsError("faults.odometry.false_travel: expected vehicle.stand above 0, found 0")
 
@@ -239,14 +184,9 @@ def _poses_at(driven: Trajectory, stamps: Array) -> Array:
 # --- presets, and cars that are drawn --------------------------------------------------------------------
 
 PLAIN: Final = "plain"  # name of the preset that changes nothing
-PRESETS: Final[dict[str, dict[str, dict[str, Any]]]] = {
-    "sensor": {
-        PLAIN: {},
-        "camera": {"sensor": CAMERA, "faults": Faults(sensor=CAMERA_FAULTS)},
-        "line": {"sensor": LINE, "line": LineSettings(spacing=1.0)},
-    },
-    "odometry": {PLAIN: {}, "ins": {"odometry": INS, "vehicle": VehicleSettings(rate=INS_RATE)}},
-}
+DRAWN: Final = ("sensor", "odometry", "vehicle", "faults.sensor", "faults.odometry")  # groups of a drawn car
+_FILE: Final = Path(__file__).with_name("presets.toml")
+PRESETS: Final[dict[str, dict[str, Any]]] = parse_toml(read_text(_FILE), _FILE)
 """Settings that differ from the defaults, by group and name of the preset."""
 
 
@@ -255,7 +195,7 @@ def preset(names: Mapping[str, str]) -> SimulationSettings:
     settings = SimulationSettings()
     for group, name in names.items():
         check_name(name, PRESETS[group], f"{group}: expected a known preset")
-        settings = replace(settings, **PRESETS[group][name])
+        settings = override(settings, flatten(PRESETS[group][name]), f"{group}.{name}")
     return settings
 
 
@@ -333,9 +273,9 @@ def draw_car(rng: Generator, settings: SimulationSettings) -> SimulationSettings
         colourless=rng.uniform(0.0, 0.05),
     )
     # an odometry between a good INS and wheels with a cheap gyro
-    share = rng.random()
-    white = np.array(INS.white) ** (1.0 - share) * np.array(OdometryNoise().white) ** share
-    slow = np.array(INS.slow) * rng.uniform(0.5, 1.5)
+    ins, share = preset({"odometry": "ins"}).odometry, rng.random()
+    white = np.array(ins.white) ** (1.0 - share) * np.array(OdometryNoise().white) ** share
+    slow = np.array(ins.slow) * rng.uniform(0.5, 1.5)
     # scale and bias are those of the faults, so that the log says what was drawn
     odometry = OdometryNoise(
         white=(float(white[0]), float(white[1]), float(white[2])),

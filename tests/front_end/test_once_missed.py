@@ -13,8 +13,8 @@ from pathspace_graph.front_end.front_end import measure_log
 from pathspace_graph.front_end.noise import FIRST
 from pathspace_graph.io.log import Detections
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim.sensor import LINE, LineSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.sensor import LineSettings
+from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
 from .scenes import Camera
@@ -25,7 +25,8 @@ BEND = -0.004
 
 def test_points_of_no_line_hardly_change_the_constants_of_the_sensor() -> None:
     """One in twenty is off by about 2 m; plain least squares would shift scale and lateral offset."""
-    sensor = replace(LINE, range_max=30.0, range_sigma=0.03, range_sigma_growth=0.02, bearing_sigma=0.006)
+    sensor = preset({"sensor": "line"}).sensor
+    sensor = replace(sensor, range_max=30.0, range_sigma=0.03, range_sigma_growth=0.02, bearing_sigma=0.006)
     sensor = replace(sensor, range_bend=BEND, range_bend_from=8.0)
     settings = SimulationSettings(laps=1, sensor=sensor, line=LineSettings(spacing=2.0))
     log, rng = simulate(generate_track(np.random.default_rng(3)), settings, 3), np.random.default_rng(0)

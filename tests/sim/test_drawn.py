@@ -14,7 +14,7 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.sim.faults import Faults, OdometryFaults, SensorFaults, VehicleFaults
 from pathspace_graph.sim.sensor import ConeSensor, OdometryNoise, SensorSettings
-from pathspace_graph.sim.simulate import CAMERA, INS, SimulationSettings, draw_car, preset, simulate
+from pathspace_graph.sim.simulate import SimulationSettings, draw_car, preset, simulate
 from pathspace_graph.sim.vehicle import VehicleSettings
 
 from ..scenes.drives import bean_track
@@ -148,8 +148,11 @@ def test_drawn_cars_differ_in_everything_and_have_errors_of_either_sign() -> Non
 
 def test_the_recorded_camera_lies_within_what_is_drawn() -> None:
     """A figure that no drawn car reaches would make the recorded one an outlier."""
+    recorded = preset({"sensor": "camera", "odometry": "ins"})
     for name in ("rate", "range_max", "fov", "range_sigma", "bearing_sigma", "detection_falloff"):
         values = [getattr(car.sensor, name) for car in cars()]
-        assert 0.97 * min(values) <= getattr(CAMERA, name) <= 1.03 * max(values)
+        assert 0.97 * min(values) <= getattr(recorded.sensor, name) <= 1.03 * max(values)
     white = np.array([car.odometry.white for car in cars()])
-    assert (white.min(axis=0) >= INS.white).all() and (white.max(axis=0) <= OdometryNoise().white).all()
+    assert (white.min(axis=0) >= recorded.odometry.white).all() and (
+        white.max(axis=0) <= OdometryNoise().white
+    ).all()

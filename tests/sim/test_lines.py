@@ -13,7 +13,7 @@ from pathspace_graph.errors import SettingsError
 from pathspace_graph.io.log import Log
 from pathspace_graph.io.log_files import read_log, write_log
 from pathspace_graph.labels import LEFT, RIGHT
-from pathspace_graph.sim.sensor import LINE, LineSensor, LineSettings, as_lines, curve_through
+from pathspace_graph.sim.sensor import LineSensor, LineSettings, as_lines, curve_through
 from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track import Track, skidpad
 
@@ -21,6 +21,7 @@ from ..scenes.drives import bean_track
 
 INNER, OUTER = 20.0, 23.0  # radii of the boundaries of a ring of a road, driven to the left (m)
 AROUND = 2 * np.pi
+LINE = preset({"sensor": "line"}).sensor
 EXACT = replace(LINE, range_sigma=1e-9, range_sigma_growth=0.0, bearing_sigma=1e-9, false_positives=0.0)
 EVERYWHERE = {"range_max": 100.0, "range_min": 0.0, "fov": AROUND}
 

@@ -15,7 +15,7 @@ from pathspace_graph.io.log import Log, Truth
 from pathspace_graph.io.log_files import read_log
 from pathspace_graph.labels import LEFT, RIGHT, UNKNOWN
 from pathspace_graph.sim.sensor import ConeSensor, OdometryNoise, SensorSettings, measure_twists
-from pathspace_graph.sim.simulate import CAMERA, INS, SimulationSettings, simulate
+from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track import Track, to_map_frame
 from pathspace_graph.sim.track_generator import generate_track
 
@@ -198,6 +198,7 @@ def test_bad_settings(track: Track) -> None:
 # --- a camera's errors, and presets ----------------------------------------------------------------------
 
 
+CAMERA, INS = preset({"sensor": "camera"}).sensor, preset({"odometry": "ins"}).odometry
 EVERY = replace(
     CAMERA, detection_falloff=0.0, false_positives=0.0, dropped_cycles=0.0, duplicates=0.0, wrong_colour=0.0
 )

@@ -29,7 +29,7 @@ from pathspace_graph.eval.experiment.study import (
 from pathspace_graph.eval.metrics.measures import lap_times
 from pathspace_graph.settings.checked import leaves, override
 from pathspace_graph.settings.mapper import MapperSettings
-from pathspace_graph.sim.simulate import CAMERA, CAMERA_FAULTS, INS, INS_RATE, SimulationSettings, simulate
+from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track_files import read_track
 from pathspace_graph.sim.vehicle import VehicleSettings
 
@@ -166,9 +166,15 @@ def test_a_noise_names_presets_and_overrides_them() -> None:
     noise = {"sensor": {"preset": "camera", "range_max": 30.0}, "odometry": {"preset": "ins"}}
     study = study_from({"tracks": [0], "noise": {"camera": noise}})
     simulation = study.simulation("camera")
-    assert simulation.sensor == replace(CAMERA, range_max=30.0)
-    assert (simulation.odometry, simulation.vehicle.rate) == (INS, INS_RATE)
-    assert simulation.faults.sensor == CAMERA_FAULTS
+    named = preset({"sensor": "camera", "odometry": "ins"})
+    assert simulation.sensor == replace(named.sensor, range_max=30.0) != named.sensor
+    assert (simulation.odometry, simulation.vehicle) == (named.odometry, named.vehicle)
+    assert simulation.faults == named.faults
+    assert (simulation.sensor.rate, simulation.vehicle.rate, simulation.faults.sensor.yaw) == (
+        5.0,
+        40.0,
+        -0.0175,
+    )
     assert study.varied_noise == ("sensor.range_max",)
     with pytest.raises(SettingsError, match=r"sensor: expected a known preset.*'camra'"):
         study_from({"tracks": [0], "noise": {"camera": {"sensor.preset": "camra"}}})

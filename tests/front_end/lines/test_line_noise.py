@@ -14,15 +14,15 @@ from pathspace_graph.io.log import Log
 from pathspace_graph.run import split_odometry
 from pathspace_graph.settings.mapper import MapperSettings
 from pathspace_graph.sim.faults import Faults, SensorFaults
-from pathspace_graph.sim.sensor import LINE, LineSettings
-from pathspace_graph.sim.simulate import SimulationSettings, simulate
+from pathspace_graph.sim.sensor import LineSettings
+from pathspace_graph.sim.simulate import SimulationSettings, preset, simulate
 from pathspace_graph.sim.track_generator import generate_track
 
 SETTINGS = MapperSettings(kind="line")
 ERRORS = SensorFaults(latency=0.1, yaw=0.03, lateral=0.05, range_scale=0.05, range_bias=-0.1)
 BEND = -0.004
 SENSOR = replace(
-    LINE,
+    preset({"sensor": "line"}).sensor,
     range_max=30.0,
     range_sigma=0.03,
     range_sigma_growth=0.02,
