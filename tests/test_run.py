@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import pickle
 import time
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -19,7 +20,7 @@ from threadpoolctl import threadpool_info
 from pathspace_graph.io.log import Detections, Log, Odometry
 from pathspace_graph.io.map import Map, PointBoundary
 from pathspace_graph.labels import LEFT
-from pathspace_graph.run import CycleResult, ObservedCycle, Stopwatch, run_online, split_odometry
+from pathspace_graph.run import CycleResult, ObservedCycle, StageTimes, Stopwatch, run_online, split_odometry
 
 
 def detections(t: float) -> Detections:
@@ -255,6 +256,10 @@ def test_a_stage_that_comes_twice_keeps_the_time_of_both(monkeypatch: pytest.Mon
     for stage in ("optimum", "start", "optimum"):
         watch.lap(stage)
     assert watch.laps == {"optimum": 4.0, "start": 2.0}
+    kept = pickle.loads(pickle.dumps(StageTimes(watch.laps)))
+    assert kept == watch.laps and [*kept] == [*watch.laps]
+    with pytest.raises(KeyError):
+        kept["end"]
     assert watch.spent == 6.0
 
 
