@@ -164,10 +164,6 @@ class LapSolver(Copyable):
         """Whether a batch is running."""
         return self._batch is not None
 
-    def is_due(self, cycle: int) -> bool:
-        """Whether the result of a batch is expected in this cycle, though it may be late."""
-        return self._batch is not None and cycle == self._batch.due
-
     @property
     def first_kept(self) -> int | None:
         """Return the first cycle whose pose must stay in the window for a running batch."""

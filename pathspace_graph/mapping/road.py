@@ -5,7 +5,6 @@ A cycle follows the paper: predict, classify, expand, update, and finally margin
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf
 from typing import ClassVar, Final, Self
 
 import gtsam
@@ -93,20 +92,20 @@ class Road:
             self.growth.observe(track, new, detections.t)
         return Classified(new, tested)
 
-    def expand(self, *, replaced: bool = False) -> str:
+    def expand(self, *, solving: bool = False) -> str:
         """Grow open curves, and deactivate the part of the map behind; return a notice.
 
-        Neither is worth its time where the map is going to be `replaced` in this cycle. A cycle that has
-        grown leaves a stretch to the next ones, if they can wait.
+        A stretch is deactivated in a cycle that has not grown, if it can wait so long, and later while a
+        batch is `solving` the drive, since its map will replace this one.
         """
         self.grown, notice = frozenset(), ""
-        if not self.closed and not replaced:
+        if not self.closed:
             path_ahead = self.path.ahead(self.poses[-1], GROWTH_REACH)
             self.grown, notice = self.growth.expand(self.smoother, path_ahead)
             if self.grown:
                 self.smoother.map.lay_out_stations()  # control points are on other rows
-        waiting = inf if replaced else 2.0 * FAR_STRETCH if self.grown else FAR_STRETCH
-        self.smoother.deactivate_distant(waiting)
+        waiting = 4.0 if solving else 2.0 if self.grown else 1.0
+        self.smoother.deactivate_distant(waiting * FAR_STRETCH)
         return notice
 
     def update(self) -> None:

@@ -415,8 +415,7 @@ class FixedLagMapper(MapperEstimate):
         classified = road.classify(reading.detections, twist, use=use)
         phase, health = self.phase.judge(road, drive, classified, reading)
         watch.lap("classify")
-        replaced = drive.solver.is_due(road.next_cycle - 1)
-        grown = road.expand(replaced=replaced)  # through detections that no curve explains
+        grown = road.expand(solving=drive.solver.is_busy)  # through detections that no curve explains
         watch.lap("expand")
         road.update()
         watch.lap("update")

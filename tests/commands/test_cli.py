@@ -173,7 +173,7 @@ def test_an_estimate_that_cannot_be_computed_is_one_line_and_exit_code_3(
         raise np.linalg.LinAlgError("SVD did not\nconverge")
 
     monkeypatch.setattr(LandmarkFixedLag, "update", fails)
-    monkeypatch.setattr(system, "solution", fails)
+    monkeypatch.setattr(system, "bayes_net", fails)
     command = "batch" if estimator == "spline" else "online"
     options = (
         ["--estimator", estimator, "--start", "odometry"]

@@ -17,7 +17,7 @@ from pathspace_graph.cli import BROKEN_PIPE, ESSENTIAL, main, parse
 from pathspace_graph.io.files import write_json
 from pathspace_graph.settings.checked import leaves
 from pathspace_graph.settings.mapper import GateSettings, MapperSettings
-from pathspace_graph.sim.simulate import PRESETS, SimulationSettings
+from pathspace_graph.sim.simulate import SimulationSettings, preset
 
 SCREEN = 50
 """Lines of a screen."""
@@ -96,10 +96,10 @@ def test_options_of_several_values() -> None:
 def test_presets_set_what_no_option_sets() -> None:
     command = ["simulate", "--event", "skidpad", "--out", "L"]
     given = options_of(*command, "--sensor", "camera", "--sensor.range-max", "9", "--odometry", "ins")
-    preset = PRESETS["sensor"]["camera"]
-    assert given.settings.sensor == replace(preset["sensor"], range_max=9.0)
-    assert given.settings.faults == preset["faults"]
-    assert given.settings.odometry == PRESETS["odometry"]["ins"]["odometry"]
+    expected = preset({"sensor": "camera", "odometry": "ins"})
+    assert given.settings.sensor == replace(expected.sensor, range_max=9.0) != SimulationSettings().sensor
+    assert given.settings.faults == expected.faults != SimulationSettings().faults
+    assert given.settings.odometry == expected.odometry != SimulationSettings().odometry
     assert options_of(*command).settings == SimulationSettings()
 
 

@@ -107,15 +107,6 @@ def test_a_batch_that_is_late_when_the_drive_ends_is_recorded_past_its_last_cycl
     assert outcome(again, 351, 270) == lap_solver.BATCH_LATE
 
 
-def test_a_result_is_expected_in_one_cycle_and_may_be_late(sent: list[Lap]) -> None:
-    one = solver()
-    assert not one.is_due(130)
-    begin(one, 100, 120)
-    due = next(cycle for cycle in range(120, 200) if one.is_due(cycle))
-    assert outcome(one, due - 1, 100) is None and outcome(one, due, 100) is None
-    assert one.is_busy and not one.is_due(due + 1)
-
-
 def test_the_wait_of_a_cycle_ends_with_its_period(sent: list[Lap]) -> None:
     one = solver()
     begin(one, 270, 300)

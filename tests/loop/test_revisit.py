@@ -167,7 +167,6 @@ def replaced() -> list[Replaced]:
 
     def take_marginal(road: Road, marginal: LapMarginal, given: Sequence[GivenFactor]) -> Array:
         before, after = road.copy(), road.copy()
-        before.smoother.transform_to_origin()
         mean, sigma = after.smoother.calibration_prior
         after.smoother.set_calibration_priors(mean + 0.1 * sigma, 0.5 * sigma)
         with pytest.MonkeyPatch.context() as without_steps:

@@ -52,16 +52,15 @@ def test_control_points_that_a_detection_holds_stay_active() -> None:
     assert state.boundaries[LEFT].tables.span_of(behind - 2.0) == state.active(LEFT)[0]
 
 
-def test_a_map_that_is_replaced_in_this_cycle_neither_grows_nor_becomes_inactive() -> None:
+def test_a_stretch_waits_for_a_cycle_without_growth_and_longer_for_a_batch() -> None:
     mapper, _ = map_log(exact_log(ahead(10.0, 12.0), *corridor(150.0)))
-    asked, grown = list[float](), list[bool]()
-    mapper.road.smoother.deactivate_distant = asked.append  # type: ignore[method-assign,assignment]
-    grow = lambda *_: (frozenset(grown.append(True) or ()), "")  # noqa: E731
-    mapper.road.growth.expand = grow  # type: ignore[method-assign]
-    mapper.road.expand(replaced=True)
-    assert asked == [np.inf] and not grown
-    mapper.road.expand()
-    assert asked == [np.inf, FAR_STRETCH] and grown
+    road, asked = mapper.road, list[float]()
+    road.smoother.deactivate_distant = asked.append  # type: ignore[method-assign,assignment]
+    for grown in (frozenset[int](), frozenset({LEFT})):
+        road.growth.expand = lambda *_, grown=grown: (grown, "")  # type: ignore[method-assign]
+        for solving in (False, True):
+            road.expand(solving=solving)
+    assert asked == [FAR_STRETCH, 4.0 * FAR_STRETCH, 2.0 * FAR_STRETCH, 4.0 * FAR_STRETCH]
 
 
 def test_a_stretch_of_its_length_becomes_inactive(monkeypatch: pytest.MonkeyPatch) -> None:
