@@ -8,7 +8,7 @@ has log odds against every rival: the other places, and that the vehicle is at n
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf, log
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -193,31 +193,38 @@ class SampledCurves:
         return type(self)(points, normals, trees, self.open)
 
     def fits(self, seen: Constellation, prior: Prior) -> Fits:
-        """Fit cones or points of lines, seen in the vehicle frame, on the curves from each pose of a prior.
+        """Fit cones or points of lines, seen in the vehicle frame, on the curves from all poses of a prior.
 
         Iterated closest points minimize the sum of squares across the curves, with the prior.
         """
-        found, information = list[tuple[Any, ...]](), prior.information
-        for pose, mean in zip(prior.tried, prior.means, strict=True):
-            for gate in (3.0, 2.0, 1.2, 0.7):  # largest distance from a curve, by iteration (m)
-                off, jacobian, variance, inside = self._rows(seen, pose)
-                weight = np.where(inside & (np.abs(off) < gate), seen.weight / variance, 0.0)
-                H = np.asarray((jacobian * weight[:, None]).T @ jacobian)
-                gradient = jacobian.T @ (weight * off) + information @ se2.difference(pose, mean)
-                pose = pose - np.linalg.solve(H + information, gradient)  # noqa: PLW2901
-            off, _, variance, inside = self._rows(seen, pose)
-            squares, away = np.minimum(off**2 / variance, FIT_GATE)[inside], se2.difference(pose, mean)
-            sums = seen.weight * squares.sum(), seen.weight * inside.sum(), away @ information @ away
-            found.append((pose, H + REGULAR, *sums))
-        return Fits(*map(np.array, zip(*found, strict=True)))
+        poses, information = prior.tried, prior.information
+        H = np.zeros((len(poses), 3, 3))
+        for gate in (3.0, 2.0, 1.2, 0.7):  # largest distance from a curve, by iteration (m)
+            off, jacobian, variance, inside = self._rows(seen, poses)
+            weight = np.where(inside & (np.abs(off) < gate), seen.weight / variance, 0.0)
+            transposed = np.swapaxes(jacobian * weight[..., None], 1, 2)
+            H = transposed @ jacobian
+            away = se2.difference(poses, prior.means)[..., None]
+            step = np.linalg.solve(H + information, transposed @ off[..., None] + information @ away)
+            poses = poses - step[..., 0]
+        off, _, variance, inside = self._rows(seen, poses)
+        squares = np.where(inside, np.minimum(off**2 / variance, FIT_GATE), 0.0).sum(axis=1)
+        sums = seen.weight * squares, seen.weight * inside.sum(axis=1)
+        away = se2.difference(poses, prior.means)
+        return Fits(poses, H + REGULAR, *sums, np.einsum("pi,ij,pj->p", away, information, away))
 
-    def _rows(self, seen: Constellation, pose: Array) -> tuple[Array, Array, Array, BoolArray]:
-        """Return signed distances (n,) across, derivatives (n, 3), variances (n,), and which are in view."""
-        points = se2.move_points(pose, seen.points)
-        covariances = se2.rotated(seen.covariances, np.full(len(seen), pose[2]))
-        off, normal, inside = np.zeros(len(seen)), np.zeros((len(seen), 2)), np.zeros(len(seen), bool)
+    def _rows(self, seen: Constellation, poses: Array) -> tuple[Array, Array, Array, BoolArray]:
+        """Return signed distances (p, n) across, their derivatives (p, n, 3) and variances (p, n).
+
+        They are of seen cones (n,) from each of the poses (p, 3). The last result says which are in view.
+        """
+        shape = len(poses), len(seen)
+        at, labels = np.repeat(poses, len(seen), axis=0), np.tile(seen.labels, len(poses))
+        points = se2.to_map(np.tile(seen.points, (len(poses), 1)), at)
+        covariances = se2.rotated(np.tile(seen.covariances, (len(poses), 1, 1)), at[:, 2])
+        off, normal, inside = np.zeros(len(at)), np.zeros((len(at), 2)), np.zeros(len(at), bool)
         for label, tree in self.trees.items():
-            own = np.flatnonzero(seen.labels == label)
+            own = np.flatnonzero(labels == label)
             if len(own) == 0:
                 continue
             _, nearest = tree.query(points[own])
@@ -225,9 +232,10 @@ class SampledCurves:
             off[own] = ((points[own] - self.points[label][nearest]) * normal[own]).sum(axis=1)
             last = len(self.points[label]) - 1
             inside[own] = (not self.open) | ((nearest > 0) & (nearest < last))
-        turning = (normal * se2.left_of(points - pose[:2])).sum(axis=1)
+        turning = (normal * se2.left_of(points - at[:, :2])).sum(axis=1)
         variance = np.einsum("mi,mij,mj->m", normal, covariances, normal) + CURVE_SIGMA**2
-        return off, np.column_stack([normal, turning]), variance, inside
+        jacobian = np.column_stack([normal, turning]).reshape(*shape, 3)
+        return off.reshape(shape), jacobian, variance.reshape(shape), inside.reshape(shape)
 
 
 def beginning_of(end: float) -> float:
