@@ -188,10 +188,10 @@ def station_rows(
 def integrated(
     durations: Array, twists: Array, sigmas: Array, ends: IntArray, least: float
 ) -> list[tuple[Array, Array, Array, Array]]:
-    """Return the fields of `IntegratedOdometry` but the last of each of the motions of `integrate_each`."""
+    """Return the fields of `IntegratedOdometry` but its twist, for each motion that ends at `ends` (m,).
 
-def whitener(covariance: Array, least: float) -> Array:
-    """Return lower triangular W (3, 3) with `W' W` the inverse of a covariance (3, 3) plus `least^2`."""
+    The whitener is lower triangular, with `least^2` added to the variances.
+    """
 
 def odometry_residuals(poses_start: Array, poses_end: Array, deltas: Array) -> tuple[Array, Array, Array]:
     """Return `r = Log(delta^-1 start^-1 end)` (m, 3), and its Jacobians (m, 3, 3) by start and end.

@@ -162,11 +162,8 @@ class MeasuredNoise:
         """
         if self.along is None or self.across is None:
             return None
-        ranges = np.hypot(points[:, 0], points[:, 1])
-        ray, factors = (
-            points / np.maximum(ranges, TINY)[:, None],
-            self._inflations if inflated else (1.0, 1.0),
-        )
+        ranges, ray = rays(points)
+        factors = self._inflations if inflated else (1.0, 1.0)
         along = factors[0] * self.along.sigmas(ranges) ** 2
         across = factors[1] * self.across.sigmas(ranges) ** 2
         covariances = (along - across)[:, None, None] * (ray[:, :, None] * ray[:, None, :])
@@ -207,9 +204,15 @@ class MeasuredNoise:
         return kernels.shifted(points, np.full((len(points), 3), twist), errors)
 
 
+def rays(points: Array) -> tuple[Array, Array]:
+    """Ranges (m,) of points (m, 2), and unit vectors (m, 2) along their rays, vehicle frame."""
+    ranges = np.hypot(points[:, 0], points[:, 1])
+    return ranges, points / np.maximum(ranges, TINY)[:, None]
+
+
 def ray_axes(points: Array) -> Array:
     """Unit vectors (m, 2, 2) along and across the rays to points (m, 2), vehicle frame."""
-    ray = points / np.maximum(np.hypot(points[:, 0], points[:, 1]), TINY)[:, None]
+    _, ray = rays(points)
     return np.stack([ray, left_of(ray)], axis=1)
 
 

@@ -64,9 +64,3 @@ def integrate_each(
     motions = kernels.integrated(durations, twists, sigmas, ends, MIN_SIGMA)
     last = [twists[end - 1] if count else np.zeros(3) for end, count in zip(ends, counts, strict=True)]
     return [IntegratedOdometry(*motion, twist) for motion, twist in zip(motions, last, strict=True)]
-
-
-def integrated_odometry(delta: Array, covariance: Array, calibration_jacobian: Array) -> IntegratedOdometry:
-    """Add the whitener to integrated odometry; `MIN_SIGMA` lifts a covariance of zero."""
-    whitener = kernels.whitener(covariance, MIN_SIGMA)
-    return IntegratedOdometry(delta, covariance, calibration_jacobian, whitener)

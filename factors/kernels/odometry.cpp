@@ -117,11 +117,6 @@ py::list integrated(const Array& durations, const Array& twists, const Array& si
   return out;
 }
 
-Array whitener(const Array& covariance, double least) {
-  expect(covariance.size() == 9);
-  return array_of({3, 3}, whitener_of(covariance.data(), least));
-}
-
 py::tuple odometry_residuals(const Array& starts, const Array& ends, const Array& deltas) {
   const Index m = deltas.shape(0);
   expect(starts.size() == 3 * m && ends.size() == 3 * m && deltas.size() == 3 * m);
@@ -201,7 +196,6 @@ void add_odometry(py::module_& module) {
   module.def("along_and_across", &along_and_across);
   module.def("odometry_residuals", &odometry_residuals);
   module.def("integrated", &integrated);
-  module.def("whitener", &whitener);
 }
 
 }  // namespace kernels

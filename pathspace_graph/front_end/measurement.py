@@ -14,7 +14,7 @@ import numpy as np
 
 from pathspace_graph.factors import _kernels as kernels
 from pathspace_graph.factors.arrays import Array, BoolArray, IntArray
-from pathspace_graph.factors.noise import SURE, MeasuredNoise, RayNoise, huber_weights, ray_axes
+from pathspace_graph.factors.noise import SURE, MeasuredNoise, RayNoise, huber_weights, rays
 from pathspace_graph.factors.se2 import compose, in_vehicle, left_of, rotated, se2_exp, to_map
 from pathspace_graph.factors.sensor import BENDS_FROM, SENSOR_SIZE
 from pathspace_graph.io.log import Detections, Odometry
@@ -332,7 +332,7 @@ def _of_cones(sightings: Sightings) -> Sightings:
 
 def map_rays(table: Sightings) -> Array:
     """Unit vectors (2, n, 2) along the rays and across them, map frame."""
-    ray = to_map(ray_axes(table.point)[:, 0], table.pose * [0.0, 0.0, 1.0])
+    ray = to_map(rays(table.point)[1], table.pose * [0.0, 0.0, 1.0])
     return np.array([ray, left_of(ray)])
 
 
