@@ -180,18 +180,14 @@ class ReturnFinder(Copyable):
         waited = length >= tried + closing.check_interval or cycle >= tried_cycle + RETURN_CYCLES
         if length < self._rests_until or not waited:
             return None
-        curves, smoother, poses = None, road.smoother, record.with_newest_path(road, NEWEST_PATHS[-1])
-        if self._settings.of_lines:
-            may_return = bool(road.boundaries) and road.path.near_beginning(road.poses[-1], closing)
-        else:
-            away = np.hypot(*(poses[path_lengths(poses) < CLOSES_WITHIN, :2] - poses[-1, :2]).T)
-            may_return = bool(away.min() < REACH[0] + ASTRAY * length)
-        if may_return and length > self._known[0] + SERVES:
+        if not self._may_return(road, record):
+            self._tried = length, cycle
+            return None
+        curves, smoother = None, road.smoother
+        if length > self._known[0] + SERVES:
             self._known = length, smoother.newest_covariance()
             return None
         self._tried = length, cycle
-        if not may_return:
-            return None
         if self._settings.of_lines:
             smoother.transform_to_origin()
             smoother.refresh()
@@ -200,7 +196,17 @@ class ReturnFinder(Copyable):
         lengths, self._attempts = newest_paths(length), self._attempts + 1
         newest = lengths[self._attempts % len(lengths)]
         seen_in = record.seen_in(smoother.variables.sensor, noise)
+        poses = record.with_newest_path(road, NEWEST_PATHS[-1])
         return return_to_beginning(seen_in, poses, self._known[1], road.settings, curves, (newest,))
+
+    def _may_return(self, road: Road, record: DriveRecord) -> bool:
+        """Whether the newest pose may be on the beginning again, whatever its covariance is."""
+        if self._settings.of_lines:
+            closing = self._settings.closing
+            return bool(road.boundaries) and road.path.near_beginning(road.poses[-1], closing)
+        poses = record.with_window(road)
+        away = np.hypot(*(poses[path_lengths(poses) < CLOSES_WITHIN, :2] - poses[-1, :2]).T)
+        return bool(away.min() < REACH[0] + ASTRAY * road.path.length)
 
 
 # --- other road that is driven again ---------------------------------------------------------------------

@@ -44,7 +44,8 @@ def searched(finder: ReturnFinder, cycle: int, length: float, away: float = 0.0)
     )
     path = SimpleNamespace(length=length, near_beginning=lambda *_: True)
     poses = np.array([[0.0, 0.0, 0.0], [0.0, 300.0, 0.0], [away, 0.0, 0.0]])
-    record = SimpleNamespace(seen_in=lambda *_: None, with_newest_path=lambda *_: poses)
+    of_drive: Any = lambda *_: poses  # noqa: E731
+    record = SimpleNamespace(seen_in=lambda *_: None, with_newest_path=of_drive, with_window=of_drive)
     boundaries = {0: SimpleNamespace(confirmed_end=50.0)}
     road = {
         "path": path,
